@@ -21,7 +21,8 @@ _SHARES = {
     "places": 0.005,
     "clocks": 0.005,
     "inertial": 0.005,
-    "merge": 0.08,
+    "links": 0.02,
+    "merge": 0.06,
     "fill": 0.01,
     "export": 0.01,
     "report": 0.02,
@@ -33,7 +34,8 @@ runs with three cameras, keyframes and map took 21 and 37 % of the task time."""
 _STEPS: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "keyframes": {
         "frames searched for hands": (0.0, 0.45),
-        "searching what moves by itself": (0.45, 0.75),
+        "steps to the lens": (0.45, 0.7),
+        "searching what moves by itself": (0.7, 0.75),
         "frames": (0.75, 1.0),
     },
     "map": {

@@ -224,7 +224,7 @@ class LiveProgress(_Display):
         line = Table.grid(padding=(0, 2, 0, 0))
         line.add_row(
             ProgressBar(total=1.0, completed=fraction, width=_BAR_WIDTH),
-            Text(f"{format_percent(fraction):>4}"),
+            Text(f"{format_percent(fraction):>5}"),
             Text(words),
         )
         texts = [Text(f"  {task}", style="dim", no_wrap=True, overflow="ellipsis") for task in tasks]

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX, Camera
+from bodycap_batch.model.optical_flow import unit_directions
 
 _LONG_SIDE_PX = 800
 """Maximum long side (px) of the image in which features are detected. Origin: above it, detection takes
@@ -39,7 +40,7 @@ class FrameFeatures:
     Attributes:
         rays: (N,3) unit viewing rays in the camera frame.
         cells: (N,) index of the grid cell of each feature.
-        descriptors: (N,32) uint8 ORB descriptors.
+        descriptors: (N,32) uint8 ORB descriptors; for points of tracks, the (N,) numbers of the tracks.
         pixel_rad: (N,) angle (radians) that corresponds to one px of the detection image at each feature's
             pyramid level.
         row: (N,) time at which each feature's row is exposed, relative to the middle row, in units of the
@@ -48,7 +49,7 @@ class FrameFeatures:
 
     rays: FloatArray
     cells: IntArray
-    descriptors: npt.NDArray[np.uint8]
+    descriptors: npt.NDArray[np.integer]
     pixel_rad: FloatArray
     row: FloatArray
 
@@ -75,7 +76,7 @@ def detect_features(
     px = np.array([corner.pt for corner in corners], dtype=np.float64).reshape(-1, 2)
     inside = shows_room((px + CV2_PIXEL_OFFSET_PX) / factor)
     corners, px = [corners[index] for index in np.flatnonzero(inside).tolist()], px[inside]
-    cells = _cells_of(px, (image.shape[1], image.shape[0]))
+    cells = cells_of(px, (image.shape[1], image.shape[0]))
     response = np.array([corner.response for corner in corners])
     kept = [corners[index] for index in _best_per_cell(cells, response, _FEATURES_PER_CELL)]
     described, descriptors = orb.compute(image, kept)
@@ -90,21 +91,26 @@ def detect_features(
         )
     px = np.array([corner.pt for corner in described])
     level = np.array([corner.octave for corner in described])
-    plane = camera.unproject((px + CV2_PIXEL_OFFSET_PX) / factor)
-    rays = np.column_stack([plane, np.ones(len(plane))])
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    usable = np.isfinite(rays).all(axis=1) & (rays[:, 2] > np.cos(np.deg2rad(_MAX_AXIS_ANGLE_DEG)))
+    rays, usable = usable_rays(camera, (px + CV2_PIXEL_OFFSET_PX) / factor)
     pixel_rad = 1.2**level / (factor * camera.focal_px)
     return FrameFeatures(
         rays=rays[usable],
-        cells=_cells_of(px, (image.shape[1], image.shape[0]))[usable],
+        cells=cells_of(px, (image.shape[1], image.shape[0]))[usable],
         descriptors=descriptors[usable],
         pixel_rad=pixel_rad[usable],
         row=(px[:, 0] / image.shape[1] if camera.sideways else px[:, 1] / image.shape[0])[usable] - 0.5,
     )
 
 
-def _cells_of(px: FloatArray, size: tuple[int, int]) -> IntArray:
+def usable_rays(camera: Camera, px: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return the viewing rays (N,3) of pixels (N,2), and which of them are near enough to the axis (N,)."""
+    rays = unit_directions(camera.unproject(px))
+    near = rays[:, 2] > np.cos(np.deg2rad(_MAX_AXIS_ANGLE_DEG))
+    return rays, np.asarray(np.isfinite(rays).all(axis=1) & near)
+
+
+def cells_of(px: FloatArray, size: tuple[int, int]) -> IntArray:
+    """Return the index (N,) of the grid cell of each pixel (N,2) in a picture of a size (width, height)."""
     column = np.clip((px[:, 0] * CELLS[0] / size[0]).astype(np.int64), 0, CELLS[0] - 1)
     row = np.clip((px[:, 1] * CELLS[1] / size[1]).astype(np.int64), 0, CELLS[1] - 1)
     return np.asarray(row * CELLS[0] + column)

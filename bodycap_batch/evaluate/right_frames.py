@@ -19,7 +19,7 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.evaluate.breaks import contradicted_times, scale_jumps
 from bodycap_batch.evaluate.fresh_features import FrameFeatures, match_features
 from bodycap_batch.evaluate.three_view import CommonRays, Legs, judge_legs, measure_legs
-from bodycap_batch.evaluate.two_view import WRONG_DEG, Outcome, differs, judge_rotation
+from bodycap_batch.evaluate.two_view import Outcome, differs, judge_rotation
 from bodycap_batch.model.geometry import rotation_angle_rad, so3_exp, so3_log
 from bodycap_batch.model.rotation_chain import RotationChain
 from bodycap_batch.tracks.relative_motion import Motion, RayMatches, measure_rotation
@@ -30,6 +30,9 @@ _LENS_ERROR = 0.02
 """Relative error of a turned angle through an error of the focal length. Evidence: none."""
 _MAX_CHAIN_SIGMA_DEG = 5.0
 """Maximum standard deviation (degrees) of a chain of rotations across lost frames."""
+_MAX_READOUT_TURN_DEG = 2.0
+"""Maximum turn (degrees) during the readout of a frame whose points are used for positions. Evidence:
+docs/decisions/report.md."""
 _MOVING_PERCENTILE = 75.0
 """Percentile of the displacements of matches that stands for the room."""
 _MIN_SHIFT_PX = 6.0
@@ -101,6 +104,9 @@ class Pictures:
         times_s: FloatArray | None = None,
         readout_s: float = 0.0,
         rotation_chain: RotationChain | None = None,
+        *,
+        rotations: FloatArray | None = None,
+        match: Callable[[FrameFeatures, FrameFeatures], IntArray] = match_features,
     ) -> None:
         """Take the features of all N frames.
 
@@ -110,29 +116,46 @@ class Pictures:
             readout_s: Time from the exposure of the first row to that of the last row.
             rotation_chain: How the camera turns, by tracks. It finds folds across pictures that are too
                 blurred for features.
+            rotations: (N,3,3) delivered rotations, NaN for a frame without a pose. They correct a rolling
+                shutter, and a pair that they fit needs no search, which makes the measurement three times as
+                fast. None for measurements that do not depend on the poses.
+            match: Returns the rows (M,2) of the features that two frames have in common.
         """
         self.features = features
+        self._match, self._rotations = match, rotations
         self.rotation_chain = rotation_chain
         self._times_s = np.arange(float(len(features))) if times_s is None else times_s
         self._readout_s = readout_s
         self._pairs: dict[tuple[int, int], MeasuredPair] = {}
         self._triples: dict[tuple[int, int, int], MeasuredTriple | None] = {}
+        self._turn_rad = np.zeros(len(features))
         if times_s is not None and readout_s != 0.0:
-            rows = self._correct_rows(times_s, readout_s)
-            self._pairs = {key: _measured_pair(self.features, key, matched) for key, matched in rows.items()}
+            rows = dict[tuple[int, int], IntArray]()
+            if rotations is None:
+                speed, rows = self._measured_speed(times_s)
+            else:
+                turns = np.swapaxes(rotations[1:], 1, 2) @ rotations[:-1]
+                known = np.flatnonzero(np.isfinite(turns).all(axis=(1, 2)))
+                speed = np.full((len(times_s), 2, 3), np.nan)
+                turn = so3_log(turns[known]) / np.diff(times_s)[known, None]
+                speed[known, 1] = speed[known + 1, 0] = turn
+            self._correct_rows(times_s, readout_s, speed)
+            self._pairs = {key: self._measured_pair(key, matched) for key, matched in rows.items()}
 
-    def _correct_rows(self, times_s: FloatArray, readout_s: float) -> dict[tuple[int, int], IntArray]:
-        """Move the rays to the time of the middle row.
-
-        Returns:
-            The matches of each two neighbouring frames.
-        """
+    def _measured_speed(self, times_s: FloatArray) -> tuple[FloatArray, dict[tuple[int, int], IntArray]]:
+        """Return the speed (N,2,3) of the rays, and the matches of each two neighbouring frames."""
         pairs = {(index, index + 1): self.pair(index, index + 1) for index in range(len(times_s) - 1)}
         speed = np.full((len(times_s), 2, 3), np.nan)
         for (first, second), pair in pairs.items():
             if pair.measured is not None:
                 turn = so3_log(pair.measured.rotation) / (times_s[second] - times_s[first])
                 speed[first, 1] = speed[second, 0] = turn
+        return speed, {key: pair.rows for key, pair in pairs.items()}
+
+    def _correct_rows(self, times_s: FloatArray, readout_s: float, speed: FloatArray) -> None:
+        """Move the rays to the time of the middle row."""
+        frame = np.minimum(np.arange(len(speed)), len(speed) - 2)
+        self._turn_rad = abs(readout_s) * np.linalg.norm(speed[frame, 1], axis=1)
         known = np.isfinite(speed)
         mean = np.sum(np.where(known, speed, 0.0), axis=1) / np.maximum(np.sum(known, axis=1), 1)
         interval_s = np.gradient(times_s)[:, None]
@@ -141,29 +164,29 @@ class Pictures:
             each and _at_middle_row(each, readout_s * each.row, mean[index], change[index])
             for index, each in enumerate(self.features)
         ]
-        return {key: pair.rows for key, pair in pairs.items()}
 
     def pair(self, first: int, second: int) -> MeasuredPair:
         """Match two frames and measure their relative rotation, once."""
         found = self._pairs.get((first, second))
         if found is None:
-            found = _measured_pair(self.features, (first, second))
-            self._pairs[first, second] = found
+            found = self._pairs[first, second] = self._measured_pair((first, second))
         return found
 
-    def _turns_little(self, frame: int) -> bool:
-        """Return True if the camera turns by less than `WRONG_DEG` while a frame is read out.
+    def _measured_pair(self, frames: tuple[int, int], rows: IntArray | None = None) -> MeasuredPair:
+        """Match two frames, if their matches are not given, and measure their relative rotation."""
+        first, second = self.features[frames[0]], self.features[frames[1]]
+        if first is None or second is None:
+            return MeasuredPair(rows=np.zeros((0, 2), dtype=np.int64), measured=None)
+        if rows is None:
+            rows = _not_fixed_to_camera(first, second, self._match(first, second))
+        expected = None
+        if self._rotations is not None:
+            expected = self._rotations[frames[1]].T @ self._rotations[frames[0]]
+        return MeasuredPair(rows=rows, measured=measure_rotation(_ray_matches(first, second, rows), expected))
 
-        The correction of a larger turn has an error of the size of a usual parallax.
-        """
-        if self._readout_s == 0.0:
-            return True
-        first = min(frame, len(self.features) - 2)
-        measured = self.pair(first, first + 1).measured
-        if measured is None:
-            return False
-        share = abs(self._readout_s) / float(self._times_s[first + 1] - self._times_s[first])
-        return bool(share * float(rotation_angle_rad(measured.rotation)) < np.deg2rad(WRONG_DEG))
+    def _turns_little(self, frame: int) -> bool:
+        """Return True if the camera turns little enough while a frame is read out for an exact correction."""
+        return bool(self._turn_rad[frame] < np.deg2rad(_MAX_READOUT_TURN_DEG))
 
     def triple(self, frames: tuple[int, int, int]) -> MeasuredTriple | None:
         """Measure the legs between three frames, once; None if they have too few points in common."""
@@ -235,7 +258,10 @@ def join_paths(paths: Sequence[RightFrames]) -> RightFrames:
 
 
 def measure_pictures(
-    pictures: Pictures, posed: BoolArray, progress: Callable[[int, int], None] | None = None
+    pictures: Pictures,
+    posed: BoolArray,
+    progress: Callable[[int, int], None] | None = None,
+    gaps: Mapping[int, int] = GAPS,
 ) -> PictureEvidence:
     """Match the frames of one camera with each other.
 
@@ -243,12 +269,13 @@ def measure_pictures(
         pictures: The features of all N frames.
         posed: (N,) True for frames with a delivered pose.
         progress: Receives the number of finished frames and of all frames.
+        gaps: Distances in frames of the linked frames, and every how many frames a link starts.
     """
     pairs: dict[tuple[int, int], MeasuredPair] = {}
     for first in range(len(posed)):
         if progress is not None:
             progress(first, len(posed))
-        for gap, every in GAPS.items():
+        for gap, every in gaps.items():
             second = first + gap
             if first % every == 0 and second < len(posed) and posed[first] and posed[second]:
                 pairs[first, second] = pictures.pair(first, second)
@@ -276,16 +303,6 @@ def _at_middle_row(
         rays=np.einsum("nij,nj->ni", turn, features.rays),
         pixel_rad=np.hypot(features.pixel_rad, 0.5 * np.linalg.norm(quadratic, axis=1)),
     )
-
-
-def _measured_pair(features: Features, frames: tuple[int, int], rows: IntArray | None = None) -> MeasuredPair:
-    """Match two frames, if their matches are not given, and measure their relative rotation."""
-    first, second = features[frames[0]], features[frames[1]]
-    if first is None or second is None:
-        return MeasuredPair(rows=np.zeros((0, 2), dtype=np.int64), measured=None)
-    if rows is None:
-        rows = _not_fixed_to_camera(first, second, match_features(first, second))
-    return MeasuredPair(rows=rows, measured=measure_rotation(_ray_matches(first, second, rows)))
 
 
 def _not_fixed_to_camera(first: FrameFeatures, second: FrameFeatures, rows: IntArray) -> IntArray:

@@ -16,7 +16,6 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.export.earth import earth_of_world
 from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.far_points import is_far
-from bodycap_batch.export.map_links import weakest_link
 from bodycap_batch.export.target_frames import (
     WORLD,
     main_target_name,
@@ -141,13 +140,12 @@ def observation_errors(scene: Map, trajectories: Sequence[Trajectory]) -> FloatA
 
 
 def _map_counts(scene: Map, errors: FloatArray) -> dict[str, Any]:
-    """Return the numbers of points and observations, the mean reprojection error and the weakest link."""
+    """Return the numbers of points and observations, and the mean reprojection error."""
     return {
         "points": len(scene.points),
         "far_points": int(is_far(scene).sum()),
         "measurements": len(scene.obs_px),
         "mean_reprojection_error_px": _finite_mean(errors),
-        "weakest_link": weakest_link(scene.obs_point, scene.obs_keyframe),
     }
 
 

@@ -1,24 +1,18 @@
-"""Write the motion as BVH, GLB and USD files and verify each file by reading it back."""
+"""Verify files with the motion by reading them back, and arrange the motion for them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.errors import JobError, StoreError
-from bodycap_batch.formats.bvh import read_bvh, write_bvh
 from bodycap_batch.formats.c3d import LabelledPoints
-from bodycap_batch.formats.gltf import read_glb, write_glb
-from bodycap_batch.formats.usd import read_usd, write_usd
 from bodycap_batch.model.geometry import rotation_angle_rad
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
-from bodycap_batch.model.take import Take
 
 POSITION_TOLERANCE_M = 1e-4
 """Maximum accepted distance (metres) between a joint centre in the file and in the motion.
@@ -37,53 +31,6 @@ _RATE_TOLERANCE = 1e-6
 
 Derivation: it is larger than the rounding of BVH's Frame Time with ten decimals at 240 Hz.
 """
-
-
-def write_verified_bvh(path: Path, motion: Motion, options: ExportOptions) -> Path:
-    """Write a BVH file, read it back, compare it with the motion, and return the path.
-
-    Raises:
-        StoreError: The file cannot be written, or it differs by more than 0.1 mm or 0.01° when read back.
-    """
-    write_bvh(path, motion, units=options.units, euler_order=options.euler_order)
-    _verify(path, motion, lambda file: read_bvh(file, units=options.units)[1])
-    return path
-
-
-def write_verified_glb(
-    path: Path,
-    motion: Motion,
-    earth: Mapping[str, Any] | None = None,
-    *,
-    take: Take | None = None,
-    sigma_m: FloatArray | None = None,
-) -> Path:
-    """Write a GLB file, read it back, compare it with the motion, and return the path.
-
-    Raises:
-        StoreError: The file cannot be written, or it differs by more than 0.1 mm or 0.01° when read back.
-    """
-    write_glb(path, motion, earth=earth, take=take, sigma_m=sigma_m)
-    _verify(path, motion, read_glb)
-    return path
-
-
-def write_verified_usd(
-    path: Path,
-    motion: Motion,
-    earth: Mapping[str, Any] | None = None,
-    *,
-    take: Take | None = None,
-    sigma_m: FloatArray | None = None,
-) -> Path:
-    """Write a USD file, read it back, compare it with the motion, and return the path.
-
-    Raises:
-        StoreError: The file cannot be written, or it differs by more than 0.1 mm or 0.01° when read back.
-    """
-    write_usd(path, motion, earth, take=take, sigma_m=sigma_m)
-    _verify(path, motion, read_usd)
-    return path
 
 
 def points_from_motion(
@@ -130,8 +77,8 @@ def sigma_in_layout(motion: Motion, animated: Motion, sigma_m: FloatArray) -> Fl
     return out
 
 
-def _verify(path: Path, motion: Motion, read: Callable[[Path], Motion | None]) -> None:
-    """Read a file back and compare its motion with the written motion.
+def verified(path: Path, motion: Motion, read: Callable[[Path], Motion | None]) -> list[Path]:
+    """Read a written file back, compare its motion with the written motion, and return the path in a list.
 
     A file that cannot be read, or that differs too much, is deleted.
 
@@ -153,6 +100,7 @@ def _verify(path: Path, motion: Motion, read: Callable[[Path], Motion | None]) -
             path=path,
             hint="check the disk; if the disk has no errors, report this as a bug",
         )
+    return [path]
 
 
 def motion_difference(back: Motion | None, motion: Motion) -> tuple[float, float]:

@@ -33,19 +33,20 @@ from bodycap_batch.export.metrics import collect_metrics
 from bodycap_batch.export.motion_files import (
     points_from_motion,
     sigma_in_layout,
+    verified,
     without_unsolved_branches,
-    write_verified_bvh,
-    write_verified_glb,
-    write_verified_usd,
 )
 from bodycap_batch.export.scene_files import write_colmap, write_maps, write_trajectories
 from bodycap_batch.export.take_time import take_of_motion
 from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.formats.blender import write_blender_files
+from bodycap_batch.formats.bvh import read_bvh, write_bvh
 from bodycap_batch.formats.c3d import write_c3d
 from bodycap_batch.formats.fbx import write_fbx
+from bodycap_batch.formats.gltf import read_glb, write_glb
 from bodycap_batch.formats.optional_libraries import require_libraries
 from bodycap_batch.formats.trc import write_trc
+from bodycap_batch.formats.usd import read_usd, write_usd
 from bodycap_batch.model.bone_axes import align_axes_with_bones
 from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.skeleton import Motion, with_file_zero_pose, with_outer_joints
@@ -158,11 +159,23 @@ def _motion_writers(
         left_out.append("joints.trc is not written: no exported joint was measured")
         return []
 
+    def bvh() -> list[Path]:
+        write_bvh(folder / "motion.bvh", animated, units=options.units, euler_order=options.euler_order)
+        return verified(folder / "motion.bvh", animated, lambda file: read_bvh(file, units=options.units)[1])
+
+    def glb() -> list[Path]:
+        write_glb(folder / "motion.glb", aligned, earth=earth, take=take, sigma_m=sigma)
+        return verified(folder / "motion.glb", aligned, read_glb)
+
+    def usd() -> list[Path]:
+        write_usd(folder / "motion.usd", animated, earth, take=take, sigma_m=sigma)
+        return verified(folder / "motion.usd", animated, read_usd)
+
     return {
-        "bvh": lambda: [write_verified_bvh(folder / "motion.bvh", animated, options)],
-        "glb": lambda: [write_verified_glb(folder / "motion.glb", aligned, earth, take=take, sigma_m=sigma)],
+        "bvh": bvh,
+        "glb": glb,
         "fbx": lambda: [write_fbx(folder / "motion.fbx", aligned, take)],
-        "usd": lambda: [write_verified_usd(folder / "motion.usd", animated, earth, take=take, sigma_m=sigma)],
+        "usd": usd,
         "c3d": lambda: [write_c3d(folder / "joints.c3d", centres, solved_take)],
         "trc": trc,
         "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m, solved_take)],

@@ -9,6 +9,10 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, IntArray, set_array
 from bodycap_batch.model.optical_flow import Pixels
 
+STORED_STEP = 2
+"""Every how many frames the points of the tracks are stored and used to check paths. Evidence:
+docs/decisions/report.md."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointTracks:
@@ -58,6 +62,17 @@ class PointTracks:
             tracks, other_tracks, assume_unique=True, return_indices=True
         )
         return common, px[rows], other_px[other_rows]
+
+    def chosen(self, frames: IntArray, step: int) -> PointTracks:
+        """Return the tracks of some frames, by their order, with the points of every `step`-th of them."""
+        empty = np.zeros(0, dtype=np.int64)
+        rows = [
+            np.arange(self.first[frame], self.first[frame + 1]) if number % step == 0 else empty
+            for number, frame in enumerate(frames.tolist())
+        ]
+        first = np.cumsum([0, *map(len, rows)])
+        kept = np.concatenate([empty, *rows])
+        return replace(self, first=first, track=self.track[kept], px=self.px[kept])
 
     def outside(self, regions: BoolArray) -> PointTracks:
         """Return the tracks without the observations in some regions.

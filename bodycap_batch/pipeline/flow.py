@@ -47,6 +47,7 @@ from bodycap_batch.tasks.further import FURTHER_MAPS, FURTHER_POSES, FurtherMaps
 from bodycap_batch.tasks.inertial import INERTIAL, InertialTask
 from bodycap_batch.tasks.inputs import BodyInput, CaptureRef, FileRef, stated_clocks
 from bodycap_batch.tasks.keyframes import KEYFRAMES, KeyframesTask
+from bodycap_batch.tasks.links import LINKS, LinksTask
 from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE, ExtendTask, MapTask, RefineTask
 from bodycap_batch.tasks.merge import MERGE, BoardFootage, MergeTask
 from bodycap_batch.tasks.places import PLACES, PlacesTask
@@ -171,7 +172,7 @@ class Flow:
             refined=optional_ref(refined),
         )
         body: list[Stage[Any]] = [MERGE, FILL] if has_body(self._job) else []
-        later: list[Stage[Any]] = [REGISTRATION, CLOCKS, *body, EXPORT, REPORT]
+        later: list[Stage[Any]] = [REGISTRATION, CLOCKS, LINKS, *body, EXPORT, REPORT]
         # Features and matches keep all cores busy. After them, mapping keeps one core busy. Only then does
         # another core load the libraries of later stages. Evidence: docs/decisions/pipeline.md.
         modules = [module for stage in later for module in stage.modules]
@@ -432,6 +433,23 @@ class Flow:
         )
         return further, found
 
+    def compare_with_tracks(
+        self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera
+    ) -> ByCamera:
+        """Compare the final paths with the tracks of the videos, and return the artefact of each camera."""
+        return self.runner.run_all(
+            make_task(
+                LINKS,
+                LinksTask(
+                    keyframes=artefact_ref(keyframes[name]),
+                    map=artefact_ref(scene_map),
+                    registration=artefact_ref(registration),
+                ),
+                camera=name,
+            )
+            for name, registration in registrations.items()
+        )
+
     def merge(
         self, scene_map: Artefact, registrations: ByCamera, clocks: Artefact, keyframes: ByCamera
     ) -> Artefact:
@@ -478,6 +496,7 @@ class Flow:
             registrations=refs_by_camera(results.registrations),
             clocks=artefact_ref(results.clocks),
             keyframes=refs_by_camera(results.keyframes),
+            links=refs_by_camera(results.links),
             merge=optional_ref(results.filled),
             failure=None if results.failure is None else results.failure.message,
             segments=tuple(tuple(camera.name for camera in cameras) for cameras in capture.segments()),

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from bodycap_batch.config.folder import PARTIAL
+from bodycap_batch.config.folder import PARTIAL, RUN_FILE
 from bodycap_batch.config.models import Job
-from bodycap_batch.core.errors import BodycapError
+from bodycap_batch.core.errors import BodycapError, StoreError
 from bodycap_batch.pipeline.flow import Flow
 from bodycap_batch.pipeline.results import publish
 from bodycap_batch.pipeline.run import files_of, run_stages
@@ -71,9 +71,17 @@ def remake_report(job: Job, *, out_dir: Path, settings: Settings) -> Path:
         The path of the report: in `out_dir` if the job is complete, else in ``<out_dir>/partial``.
 
     Raises:
-        BodycapError: The videos cannot be read, the disk fails, or nothing of the job is stored.
+        BodycapError: The videos cannot be read, the disk fails, nothing of the job is stored, or the folder
+            holds the results of another version of the program or of other options. Its report stays.
     """
     results, stopped_by = find_stored(job, out_dir, settings)
+    if isinstance(stopped_by, NotStored) and (out_dir / RUN_FILE).is_file():
+        raise StoreError(
+            "these results are not those of this version of bodycap with these options, so their report "
+            f"stays as it is: {stopped_by.message}",
+            path=out_dir,
+            hint=stopped_by.hint,
+        )
     again = replace(settings, redo=settings.redo | {"report"})
     with Flow(job, again, logs=out_dir / "logs") as flow:
         flow.check()

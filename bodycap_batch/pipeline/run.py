@@ -138,6 +138,7 @@ def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
     results.clocks = flow.clocks(results.map, results.registrations)
     found = flow.use_sensors(results.registrations)
     results.map, results.registrations = flow.map_lost_parts(results.map, found, keyframes)
+    results.links = flow.compare_with_tracks(results.map, results.registrations, keyframes)
     yield "registration"
     results.stage = "merge"
     if results.failure is None:

@@ -32,6 +32,7 @@ class StageResults:
         keyframes: The artefact of each camera's keyframes, by camera name.
         map: The artefact of the map.
         registrations: The registration of each camera after all further steps, by camera name.
+        links: What the tracks of each camera's video show about its paths, by camera name.
         job: The job with the places that were found from the motion; None before they are looked for.
         clocks: The artefact of the clocks of all cameras.
         merged: The artefact of the skeleton's motion.
@@ -48,6 +49,7 @@ class StageResults:
     keyframes: Mapping[str, Artefact] = field(default_factory=dict)
     map: Artefact | None = None
     registrations: Mapping[str, Artefact] = field(default_factory=dict)
+    links: Mapping[str, Artefact] = field(default_factory=dict)
     job: Job | None = None
     clocks: Artefact | None = None
     merged: Artefact | None = None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from bodycap_batch.model.joint_angles import angle_curves, foot_curves
 from bodycap_batch.model.skeleton import Motion
 from bodycap_batch.report.figures.motion_curves import Take, draw_motion_curves
 from bodycap_batch.report.figures.svg import element, path_through, svg_image, text
+from bodycap_batch.report.page import render_template
 
 MOTION_FILE = "motion.bvh"
 _TRUTH_FILES = ("gt/joints.npz", "joints.npz")
@@ -277,24 +277,14 @@ def write_comparison(comparison: Comparison, path: Path) -> Path:
     Raises:
         StoreError: The file cannot be written.
     """
-    import jinja2
-
-    folder = files("bodycap_batch.report") / "templates"
-    environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8")),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     times = [take.times_s() for take in comparison.takes]
     span = (min(float(t[0]) for t in times), max(float(t[-1]) for t in times))
-    page = environment.get_template("comparison.html").render(
-        style=(folder / "style.css").read_text(encoding="utf-8"),
+    page = render_template(
+        "comparison.html",
         sources=dict(zip(_NAMES, comparison.sources, strict=True)),
         figures=comparison.figures,
         curves=draw_motion_curves(comparison.takes, span),
         paths=draw_paths(comparison.takes),
     )
-    write_text(path, page if page.endswith("\n") else f"{page}\n")
+    write_text(path, page)
     return path

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from bodycap_batch.core.percent import format_percent
 from bodycap_batch.model.measured_parts import BODY_PARTS, PartState, part_states
 from bodycap_batch.model.merge_data import MergeResult, filled_joints
 from bodycap_batch.report.advice import recommend_changes
@@ -286,7 +287,7 @@ def _lost_pictures(losses: Sequence[DiagnosedLoss], most: int) -> list[dict[str,
 def _facts(diagnosed: DiagnosedLoss) -> str:
     parts = []
     if np.isfinite(diagnosed.loss.sharpness):
-        parts.append(f"sharpness {diagnosed.loss.sharpness:.0%}")
+        parts.append(f"sharpness {format_percent(diagnosed.loss.sharpness)}")
     if np.isfinite(diagnosed.loss.turn_deg):
         parts.append(f"turned {diagnosed.loss.turn_deg:.0f}° per frame")
     if diagnosed.appearance is not None:

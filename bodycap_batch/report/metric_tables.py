@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -54,34 +54,248 @@ class Table:
     note: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of a table whose rows are the entries of a group in ``metrics.json``.
+
+    Attributes:
+        head: Heading.
+        key: Path of the value in an entry.
+        form: Format string, function or texts by value, which give the displayed text.
+        factor: Factor that converts the value to the displayed unit.
+        bar: True for a bar behind the text, relative to the largest value of the column.
+    """
+
+    head: str
+    key: str
+    form: str | Callable[[float], str] | Mapping[str, str] = "{:,}"
+    factor: float = 1.0
+    bar: bool = False
+
+
+def _group_table(
+    metrics: Mapping[str, Any],
+    groups: Sequence[str],
+    columns: Sequence[Column],
+    name: Callable[[str], str] = str,
+    *,
+    total: str = "",
+    **words: str,
+) -> Table:
+    """Return a table with a row for each entry of some groups.
+
+    Args:
+        metrics: The content of ``metrics.json``.
+        groups: Path of each group: a mapping by name, or a list of entries with names.
+        columns: The first column holds the names, and its key is not used; the others hold values.
+        name: Returns the displayed name of an entry.
+        total: Name of a last row with the values of all entries together; "" for no such row.
+        words: Caption and note of the table.
+    """
+    rows = []
+    for group in groups:
+        entries = metric_at(metrics, group) or {}
+        is_list = isinstance(entries, list)
+        for key in range(len(entries)) if is_list else entries:
+            path = f"{group}.{metric_path(key)}"
+            label = metric_at(metrics, f"{path}.name") or f"map {key}" if is_list else key
+            rows.append((Cell(text=name(str(label))), *_value_cells(metrics, path, columns[1:])))
+    if total:
+        rows.append((Cell(text=total), *_value_cells(metrics, "total", columns[1:])))
+    for number, column in enumerate(columns):
+        largest = max((row[number].value or 0.0 for row in rows), default=0.0) if column.bar else 0.0
+        if column.bar:
+            rows = [
+                (*row[:number], replace(row[number], share=_share(row[number], largest)), *row[number + 1 :])
+                for row in rows
+            ]
+    return Table(heads=tuple(column.head for column in columns), rows=tuple(rows), **words)
+
+
+def _share(cell: Cell, largest: float) -> float:
+    return (cell.value or 0.0) / largest if largest else 0.0
+
+
+def _value_cells(metrics: Mapping[str, Any], path: str, columns: Sequence[Column]) -> list[Cell]:
+    """Return the cells of the entry at a path."""
+    cells = []
+    for column in columns:
+        place = f"{path}.{column.key}"
+        if isinstance(column.form, Mapping):
+            value = str(metric_at(metrics, place))
+            cells.append(Cell(text=column.form.get(value, value)))
+        else:
+            cells.append(metric_cell(metrics, place, column.form, column.factor))
+    return cells
+
+
+def _percent(value: float) -> str:
+    return format_percent(value, 1)
+
+
+def _sigma_percent(value: float) -> str:
+    return f"± {_percent(value)}"
+
+
+_CLOCK_SOURCES = {
+    "sound": "sound",
+    "sensors": "inertial sensors",
+    "motion": "motion",
+    "stated": "stated in the job or the calibration",
+    "common": "common clock",
+    "none": "unknown",
+}
+"""Text for the user, by the source of a clock."""
+
+
 def make_tables(inputs: ReportInputs) -> dict[str, Table]:
     """Return the tables of the page, by table name. Tables without rows are omitted."""
     metrics = inputs.metrics
     if metrics is None:
         return {}
+    clocks = _group_table(
+        metrics,
+        ["clocks"],
+        [
+            Column("Camera", ""),
+            Column("Offset", "offset_s", "{:+.4f} s"),
+            Column("Sigma", "sigma_s", "{:.1f} ms", 1000.0),
+            Column("Drift", "drift_ppm", "{:+.1f} ppm"),
+            Column("Sigma of the drift", "drift_sigma_ppm", "{:.1f} ppm"),
+            Column("Source", "source", _CLOCK_SOURCES),
+        ],
+        caption="Clocks of the cameras",
+        note="Common time = camera time · (1 + drift) + offset. The offset is relative to the reference "
+        "camera, whose offset is 0.",
+    )
     tables = {
-        "frames": _frames_table(metrics),
-        "clocks": _clocks_table(metrics),
+        "frames": _group_table(
+            metrics,
+            ["cameras"],
+            [
+                Column("Camera", ""),
+                Column("Frames", "frames"),
+                Column("Registered", "frames_registered"),
+                Column("Share", "coverage", _percent),
+                Column("Keyframes", "keyframes"),
+                Column("Median inliers", "registration.median_inliers", "{:.0f}"),
+            ],
+            total="all cameras",
+            caption="Table 1. Frames registered",
+        ),
+        "clocks": clocks if len(clocks.rows) > 1 else replace(clocks, rows=()),
         "shutters": _shutters_table(metrics),
         "sensors": _sensors_table(metrics),
-        "map": _map_table(metrics),
+        "map": _group_table(
+            metrics,
+            ["cameras", "models"],
+            [
+                Column("Seen by", ""),
+                Column("Points", "points"),
+                Column("Measurements", "measurements"),
+                Column("Mean reprojection error", "mean_reprojection_error_px", "{:.2f} px"),
+            ],
+            total="all",
+            caption="Table 2. The map",
+            note="Errors in pixels are measured in the reduced frames (long side: `work_px`).",
+        ),
     }
     if "merge" in metrics:
-        merge = metrics["merge"]
-        tables |= {
-            "residuals": _residuals_table(merge),
-            "joints": _joint_distance_table(merge, "joint_gap_m", "Distance between bones at each joint"),
-            "hinges": _joint_distance_table(
-                merge, "hinge_off_plane_m", "Distance of elbows and knees from their bending plane"
-            ),
-            "mounts": _mounts_table(merge),
-            "joined": _joined_cameras_table(merge),
-            "scale": _scale_table(merge),
-            "rules": _soft_limits_table(merge),
-            "sigma": _joint_sigma_table(inputs),
-            "flexion": _flexion_table(merge),
-        }
-    return {name: table for name, table in tables.items() if table.rows}
+        tables |= _body_tables(metrics) | {"sigma": _joint_sigma_table(inputs)}
+    return {name: tables[name] for name in _ORDER if name in tables and tables[name].rows}
+
+
+_ORDER = (
+    "frames", "clocks", "shutters", "sensors", "map", "residuals", "joints", "hinges", "mounts", "joined",
+    "scale", "rules", "sigma", "flexion",
+)  # fmt: skip
+
+
+def _body_tables(metrics: Mapping[str, Any]) -> dict[str, Table]:
+    """Return the tables about the body, by table name."""
+    scale = metrics["merge"].get("scale", {})
+    distances = (
+        Column("Joint", ""),
+        Column("Distance, median", "p50", "{:.2f} mm", 1000.0),
+        Column("Distance, 95th percentile", "p95", "{:.2f} mm", 1000.0, bar=True),
+    )
+    return {
+        "residuals": _group_table(
+            metrics,
+            ["merge.cameras"],
+            [
+                Column("Camera", ""),
+                Column("Poses", "measurements"),
+                Column("Excluded", "dropped_as_gross_errors"),
+                Column("Down-weighted", "down_weighted"),
+                Column("Longest gap", "longest_gap_s", "{:.2f} s"),
+                Column("Distance, median", "residual_m.p50", "{:.2f} cm", 100.0),
+                Column("Distance, 95th percentile", "residual_m.p95", "{:.2f} cm", 100.0, bar=True),
+                Column("Rotation, 95th percentile", "residual_deg.p95", "{:.2f}°"),
+            ],
+            caption="Difference between each camera's poses and the solved body",
+        ),
+        "joints": _group_table(
+            metrics, ["merge.joint_gap_m"], distances, caption="Distance between bones at each joint"
+        ),
+        "hinges": _group_table(
+            metrics,
+            ["merge.hinge_off_plane_m"],
+            distances,
+            caption="Distance of elbows and knees from their bending plane",
+        ),
+        "mounts": _group_table(
+            metrics,
+            ["merge.mounts"],
+            [
+                Column("Camera", ""),
+                Column("Bone", "role", {}),
+                Column("Roll", "roll_deg", "{:.0f}°"),
+                Column("Rotation from the assumed mount", "from_prior_deg", "{:.1f}°"),
+                Column("Distance from the assumed mount", "from_prior_m", "{:.1f} cm", 100.0),
+                Column("Rotation uncertainty", "sigma_deg", "± {:.1f}°"),
+                Column("Position uncertainty", "sigma_m", "± {:.1f} cm", 100.0),
+            ],
+            caption="Estimated mounts",
+        ),
+        "joined": _group_table(
+            metrics,
+            ["merge.joined_cameras"],
+            [
+                Column("Camera", ""),
+                Column("Rotation uncertainty", "sigma_deg", "± {:.1f}°"),
+                Column("Position uncertainty", "sigma_m", "± {:.1f} cm", 100.0),
+            ],
+            caption="Cameras whose position only the body's movement determines",
+            note="The map of these cameras has no place in common with the main map.",
+        ),
+        "scale": _group_table(
+            metrics,
+            ["merge.scale.sources"],
+            [
+                Column("Source", ""),
+                Column("Uncertainty", "relative_sigma", _sigma_percent),
+                Column("Difference from the used scale", "off", "{:+.1f} %", 100.0),
+                Column("", "used", {"True": "used", "False": "not used"}),
+            ],
+            caption="Sources of the metric scale",
+            note=_chi_square_note(scale),
+        ),
+        "rules": _soft_limits_table(metrics),
+        "flexion": _group_table(
+            metrics,
+            ["merge.flexion_sigma_deg"],
+            [
+                Column("Joint", ""),
+                Column("Measured", "observed.p50", "± {:.0f}°"),
+                Column("In gaps", "filled.p50", "± {:.0f}°"),
+            ],
+            _hinge_text,
+            caption="Uncertainty of the bending angle of elbows and knees (one standard deviation, median)",
+            note="Most of it is an error that stays the same over the capture: it comes from the mounts, the "
+            "metric scale and the bone lengths.",
+        ),
+    }
 
 
 def metric_cell(
@@ -104,64 +318,6 @@ def metric_cell(
     shown = value if factor == 1.0 else factor * value
     text = form.format(shown) if isinstance(form, str) else form(shown)
     return Cell(text=text, metric=dotted, value=value)
-
-
-def _percent(value: float) -> str:
-    return format_percent(value, 1)
-
-
-def _frames_table(metrics: Mapping[str, Any]) -> Table:
-    rows = []
-    paths = {name: metric_path("cameras", name) for name in metrics["cameras"]}
-    for name, path in (*paths.items(), ("all cameras", "total")):
-        rows.append(
-            (
-                Cell(text=name),
-                metric_cell(metrics, f"{path}.frames"),
-                metric_cell(metrics, f"{path}.frames_registered"),
-                metric_cell(metrics, f"{path}.coverage", _percent),
-                metric_cell(metrics, f"{path}.keyframes"),
-                metric_cell(metrics, f"{path}.registration.median_inliers", "{:.0f}")
-                if path != "total"
-                else Cell(text=""),
-            )
-        )
-    heads = ("Camera", "Frames", "Registered", "Share", "Keyframes", "Median inliers")
-    return Table(caption="Table 1. Frames registered", heads=heads, rows=tuple(rows))
-
-
-_CLOCK_SOURCES = {
-    "sound": "sound",
-    "sensors": "inertial sensors",
-    "motion": "motion",
-    "stated": "stated in the job or the calibration",
-    "common": "common clock",
-    "none": "unknown",
-}
-"""Text for the user, by the source of a clock."""
-
-
-def _clocks_table(metrics: Mapping[str, Any]) -> Table:
-    rows = []
-    for name, clock in metrics.get("clocks", {}).items():
-        path = metric_path("clocks", name)
-        rows.append(
-            (
-                Cell(text=name),
-                metric_cell(metrics, f"{path}.offset_s", "{:+.4f} s"),
-                metric_cell(metrics, f"{path}.sigma_s", "{:.1f} ms", 1000.0),
-                metric_cell(metrics, f"{path}.drift_ppm", "{:+.1f} ppm"),
-                metric_cell(metrics, f"{path}.drift_sigma_ppm", "{:.1f} ppm"),
-                Cell(text=_CLOCK_SOURCES.get(clock["source"], str(clock["source"]))),
-            )
-        )
-    return Table(
-        caption="Clocks of the cameras",
-        heads=("Camera", "Offset", "Sigma", "Drift", "Sigma of the drift", "Source"),
-        rows=tuple(rows) if len(rows) > 1 else (),
-        note="Common time = camera time · (1 + drift) + offset. The offset is relative to the reference "
-        "camera, whose offset is 0.",
-    )
 
 
 _READOUT_SOURCES = {
@@ -214,189 +370,36 @@ _SENSOR_VERDICTS = {
 
 
 def _sensors_table(metrics: Mapping[str, Any]) -> Table:
-    rows, reasons = [], []
-    for name, sensor in metrics.get("telemetry", {}).items():
-        path = metric_path("telemetry", name)
-        if sensor["verdict"] != "agrees":
-            reasons.append(f"{name}: {sensor['reason']}.")
-        if "stabilisation" in sensor:
-            reasons.append(f"{name}: {sensor['stabilisation']['reason']}.")
-        rows.append(
-            (
-                Cell(text=name),
-                Cell(text=_SENSOR_VERDICTS.get(sensor["verdict"], str(sensor["verdict"]))),
-                metric_cell(metrics, f"{path}.delay_s", "{:+.1f} ms", 1000.0),
-                metric_cell(metrics, f"{path}.delay_sigma_s", "{:.1f} ms", 1000.0),
-                metric_cell(metrics, f"{path}.turned_deg", "{:.1f}°"),
-                metric_cell(metrics, f"{path}.rate_ppm", "{:+.0f} ppm"),
-                metric_cell(metrics, f"{path}.frames_filled"),
-            )
+    sensors = metrics.get("telemetry", {})
+    reasons = [
+        f"{name}: {reason}."
+        for name, sensor in sensors.items()
+        for reason in (
+            sensor["reason"] if sensor["verdict"] != "agrees" else "",
+            sensor.get("stabilisation", {}).get("reason", ""),
         )
-    return Table(
+        if reason
+    ]
+    return _group_table(
+        metrics,
+        ["telemetry"],
+        [
+            Column("Camera", ""),
+            Column("Sensor", "verdict", _SENSOR_VERDICTS),
+            Column("Delay", "delay_s", "{:+.1f} ms", 1000.0),
+            Column("Sigma", "delay_sigma_s", "{:.1f} ms", 1000.0),
+            Column("Turned by", "turned_deg", "{:.1f}°"),
+            Column("Clock rate", "rate_ppm", "{:+.0f} ppm"),
+            Column("Lost frames with a pose", "frames_filled"),
+        ],
         caption="Inertial sensors",
-        heads=("Camera", "Sensor", "Delay", "Sigma", "Turned by", "Clock rate", "Lost frames with a pose"),
-        rows=tuple(rows),
         note=" ".join(["Time of a sample = time of the frame + delay.", *reasons]),
     )
 
 
-def _map_table(metrics: Mapping[str, Any]) -> Table:
-    paths = [(name, metric_path("cameras", name)) for name in metrics["cameras"]]
-    paths += [(f"map {index}", metric_path("models", index)) for index in range(len(metrics["models"]))]
-    rows = []
-    for head, path in (*paths, ("all", "total")):
-        rows.append(
-            (
-                Cell(text=head),
-                metric_cell(metrics, f"{path}.points"),
-                metric_cell(metrics, f"{path}.measurements"),
-                metric_cell(metrics, f"{path}.mean_reprojection_error_px", "{:.2f} px"),
-            )
-        )
-    return Table(
-        caption="Table 2. The map",
-        heads=("Seen by", "Points", "Measurements", "Mean reprojection error"),
-        rows=tuple(rows),
-        note="Errors in pixels are measured in the reduced frames (long side: `work_px`).",
-    )
-
-
-def _residuals_table(merge: Mapping[str, Any]) -> Table:
-    metrics = {"merge": merge}
-    cameras = merge.get("cameras", {})
-    largest = max((camera["residual_m"]["p95"] for camera in cameras.values()), default=0.0)
-    rows = []
-    for name, camera in cameras.items():
-        path = metric_path("merge", "cameras", name)
-        p95 = metric_cell(metrics, f"{path}.residual_m.p95", "{:.2f} cm", 100.0)
-        rows.append(
-            (
-                Cell(text=name),
-                metric_cell(metrics, f"{path}.measurements"),
-                metric_cell(metrics, f"{path}.dropped_as_gross_errors"),
-                metric_cell(metrics, f"{path}.down_weighted"),
-                metric_cell(metrics, f"{path}.longest_gap_s", "{:.2f} s"),
-                metric_cell(metrics, f"{path}.residual_m.p50", "{:.2f} cm", 100.0),
-                replace(p95, share=camera["residual_m"]["p95"] / largest if largest else 0.0),
-                metric_cell(metrics, f"{path}.residual_deg.p95", "{:.2f}°"),
-            )
-        )
-    heads = (
-        "Camera",
-        "Poses",
-        "Excluded",
-        "Down-weighted",
-        "Longest gap",
-        "Distance, median",
-        "Distance, 95th percentile",
-        "Rotation, 95th percentile",
-    )
-    return Table(
-        caption="Difference between each camera's poses and the solved body", heads=heads, rows=tuple(rows)
-    )
-
-
-def _joint_distance_table(merge: Mapping[str, Any], key: str, caption: str) -> Table:
-    """Return a table with the median and the 95th percentile of a distance at each joint.
-
-    A bar shows the 95th percentile relative to the largest 95th percentile in the table.
-
-    Args:
-        merge: The entry ``merge`` of ``metrics.json``.
-        key: Name of the distance in this entry.
-        caption: Caption of the table.
-    """
-    metrics, distances = {"merge": merge}, merge.get(key, {})
-    largest = max((distance["p95"] for distance in distances.values()), default=0.0)
-    rows = []
-    for role in distances:
-        path = metric_path("merge", key, role)
-        p95 = metric_cell(metrics, f"{path}.p95", "{:.2f} mm", 1000.0)
-        share = distances[role]["p95"] / largest if largest else 0.0
-        rows.append(
-            (
-                Cell(text=role),
-                metric_cell(metrics, f"{path}.p50", "{:.2f} mm", 1000.0),
-                replace(p95, share=share),
-            )
-        )
-    return Table(
-        caption=caption, heads=("Joint", "Distance, median", "Distance, 95th percentile"), rows=tuple(rows)
-    )
-
-
-def _mounts_table(merge: Mapping[str, Any]) -> Table:
-    metrics = {"merge": merge}
-    rows = []
-    for name, mount in merge.get("mounts", {}).items():
-        path = metric_path("merge", "mounts", name)
-        rows.append(
-            (
-                Cell(text=name),
-                Cell(text=str(mount["role"])),
-                metric_cell(metrics, f"{path}.roll_deg", "{:.0f}°"),
-                metric_cell(metrics, f"{path}.from_prior_deg", "{:.1f}°"),
-                metric_cell(metrics, f"{path}.from_prior_m", "{:.1f} cm", 100.0),
-                metric_cell(metrics, f"{path}.sigma_deg", "± {:.1f}°"),
-                metric_cell(metrics, f"{path}.sigma_m", "± {:.1f} cm", 100.0),
-            )
-        )
-    heads = (
-        "Camera",
-        "Bone",
-        "Roll",
-        "Rotation from the assumed mount",
-        "Distance from the assumed mount",
-        "Rotation uncertainty",
-        "Position uncertainty",
-    )
-    return Table(caption="Estimated mounts", heads=heads, rows=tuple(rows))
-
-
-def _joined_cameras_table(merge: Mapping[str, Any]) -> Table:
-    metrics = {"merge": merge}
-    rows = tuple(
-        (
-            Cell(text=name),
-            metric_cell(metrics, metric_path("merge", "joined_cameras", name, "sigma_deg"), "± {:.1f}°"),
-            metric_cell(
-                metrics, metric_path("merge", "joined_cameras", name, "sigma_m"), "± {:.1f} cm", 100.0
-            ),
-        )
-        for name in merge.get("joined_cameras", {})
-    )
-    return Table(
-        caption="Cameras whose position only the body's movement determines",
-        heads=("Camera", "Rotation uncertainty", "Position uncertainty"),
-        rows=rows,
-        note="The map of these cameras has no place in common with the main map.",
-    )
-
-
-def _scale_table(merge: Mapping[str, Any]) -> Table:
-    scale = merge.get("scale", {})
-    rows = tuple(
-        (
-            *_scale_source_cells(merge, f"merge.scale.sources.{index}"),
-            Cell(text="used" if source["used"] else "not used"),
-        )
-        for index, source in enumerate(scale.get("sources", ()))
-    )
-    return Table(
-        caption="Sources of the metric scale",
-        heads=("Source", "Uncertainty", "Difference from the used scale", ""),
-        rows=rows,
-        note=_chi_square_note(scale),
-    )
-
-
-def _scale_source_cells(merge: Mapping[str, Any], path: str) -> tuple[Cell, ...]:
-    metrics = {"merge": merge}
-    return (
-        Cell(text=str(metric_at(metrics, f"{path}.name"))),
-        metric_cell(metrics, f"{path}.relative_sigma", "± {:.1%}"),
-        metric_cell(metrics, f"{path}.off", "{:+.1%}"),
-    )
+def _hinge_text(role: str) -> str:
+    side, part = split_side(role)
+    return f"{side.lower()} {_HINGE_TEXTS[part]}".strip()
 
 
 def _chi_square_note(agreement: Mapping[str, Any]) -> str:
@@ -417,19 +420,18 @@ def _chi_square_note(agreement: Mapping[str, Any]) -> str:
     )
 
 
-def _soft_limits_table(merge: Mapping[str, Any]) -> Table:
-    metrics, activity = {"merge": merge}, merge.get("activity", {})
+def _soft_limits_table(metrics: Mapping[str, Any]) -> Table:
+    activity = metrics["merge"].get("activity", {})
     rows = []
     for name, share in activity.get("rules_active", {}).items():
         active = metric_cell(metrics, metric_path("merge", "activity", "rules_active", name), _percent)
-        has_excess = name in activity.get("rules_pressed_m", {})
         path = metric_path("merge", "activity", "rules_pressed_m", name)
         excess = [metric_cell(metrics, f"{path}.{key}", "{:.1f} cm", 100.0) for key in ("p50", "p95")]
         rows.append(
             (
                 Cell(text=_limit_text(str(name))),
                 replace(active, share=float(share)),
-                *(excess if has_excess else (Cell(text="–"), Cell(text="–"))),
+                *excess,
             )
         )
     return Table(
@@ -472,25 +474,6 @@ def _joint_sigma_table(inputs: ReportInputs) -> Table:
     )
 
 
-def _flexion_table(merge: Mapping[str, Any]) -> Table:
-    """Return how well the angles of elbows and knees are known."""
-    metrics, rows = {"merge": merge}, []
-    for role in merge.get("flexion_sigma_deg", {}):
-        side, part = split_side(role)
-        paths = [
-            metric_path("merge", "flexion_sigma_deg", role, name, "p50") for name in ("observed", "filled")
-        ]
-        name = Cell(text=f"{side.lower()} {_HINGE_TEXTS[part]}".strip())
-        rows.append((name, *(metric_cell(metrics, path, "± {:.0f}°") for path in paths)))
-    return Table(
-        caption="Uncertainty of the bending angle of elbows and knees (one standard deviation, median)",
-        heads=("Joint", "Measured", "In gaps"),
-        rows=tuple(rows),
-        note="Most of it is an error that stays the same over the capture: it comes from the mounts, the "
-        "metric scale and the bone lengths.",
-    )
-
-
 def headline_figures(metrics: Mapping[str, Any]) -> Iterable[tuple[str, Cell]]:
     """Yield the name and the cell of each value at the top of the page."""
     yield "frames registered", metric_cell(metrics, "total.frames_registered")
@@ -506,4 +489,4 @@ def headline_figures(metrics: Mapping[str, Any]) -> Iterable[tuple[str, Cell]]:
         if worst is not None:
             path = metric_path("merge", "cameras", worst[0], "longest_gap_s")
             yield "longest gap", metric_cell(metrics, path, "{:.2f} s")
-        yield "metric scale", metric_cell(metrics, "merge.scale.relative_sigma", "± {:.1%}")
+        yield "metric scale", metric_cell(metrics, "merge.scale.relative_sigma", _sigma_percent)

@@ -46,26 +46,34 @@ def render_page(context: Mapping[str, Any], data: Mapping[str, Any]) -> str:
     Raises:
         StoreError: The 3D library's file is missing from its package.
     """
+    return render_template(
+        "page.html",
+        **context,
+        script="\n".join(map(_template, _SCRIPTS)),
+        library=viewer_library() if context["has_viewer"] else "",
+        library_name=f"{LIBRARY} {metadata.version(LIBRARY)}",
+        data=json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
+    )
+
+
+def render_template(template: str, /, **context: Any) -> str:
+    """Render a page with the style of the report as one HTML document."""
     import jinja2
 
-    folder = files("bodycap_batch.report") / "templates"
     environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8")),
+        loader=jinja2.FunctionLoader(_template),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     environment.filters["code"] = _with_code
-    text = environment.get_template("page.html").render(
-        **context,
-        style=(folder / "style.css").read_text(encoding="utf-8"),
-        script="\n".join((folder / name).read_text(encoding="utf-8") for name in _SCRIPTS),
-        library=viewer_library() if context["has_viewer"] else "",
-        library_name=f"{LIBRARY} {metadata.version(LIBRARY)}",
-        data=json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
-    )
+    text = environment.get_template(template).render(**context, style=_template("style.css"))
     return text if text.endswith("\n") else f"{text}\n"
+
+
+def _template(name: str) -> str:
+    return (files("bodycap_batch.report") / "templates" / name).read_text(encoding="utf-8")
 
 
 def _with_code(text: str) -> Markup:

@@ -190,23 +190,25 @@ def read_path_uncertainty(metrics: Metrics) -> Reading | None:
     return Reading(value=share, words={"camera": name, "percent": f"{100 * share:.2g} %"})
 
 
-def read_main_share(metrics: Metrics) -> Reading | None:
-    """Read the share of the keyframes that are in the main map, if a video is in several maps."""
-    counts = [model.get("keyframes", {}) for model in metrics.get("models", ())]
-    split = {name for name in (counts[0] if counts else ()) if any(name in count for count in counts[1:])}
-    if not split:
+def read_links(metrics: Metrics) -> Reading | None:
+    """Read the largest share of a camera's frames, in all maps, that the tracks of its video contradict."""
+    shares = {
+        name: sum(path["contradicted"] for path in paths) / compared
+        for name, paths in metrics.get("mapping", {}).get("links", {}).items()
+        if (compared := sum(path["compared"] for path in paths))
+    }
+    name, share = _largest(shares.items(), float)
+    if share is None:
         return None
-    inside = sum(counts[0][name] for name in split)
-    every = sum(count.get(name, 0) for count in counts for name in split)
-    return Reading(
-        value=inside / every,
-        words={
-            "cameras": " and ".join(sorted(split)),
-            "inside": inside,
-            "every": every,
-            "maps": len(counts),
-        },
-    )
+    numbers = {frame: n for n, frame in enumerate(dict.fromkeys(each["frame"] for each in metrics["models"]))}
+    where = [
+        "frames {} to {}".format(*path["contradicted_frames"])
+        + (f" in map_{number}" if (number := numbers.get(path["frame"], 0)) else "")
+        for path in metrics["mapping"]["links"][name]
+        if path["contradicted"]
+    ]
+    words = {"camera": name, "where": f" ({'; '.join(where)})" if where else ""}
+    return Reading(value=share, metric=metric_path("mapping", "links", name), words=words)
 
 
 def read_unconfirmed(metrics: Metrics) -> Reading | None:
@@ -375,7 +377,7 @@ def read_scale(metrics: Metrics) -> Reading | None:
         value=float(sigma),
         metric="merge.scale.relative_sigma",
         words={
-            "percent": f"{sigma:.1%}",
+            "percent": format_percent(sigma, 1),
             "height": f"{100.0 * _BODY_HEIGHT_M * sigma:.0f} cm",
             "action": as_sentence(f"{action}{t_pose}"),
             "how": as_sentence("; ".join(how)) if action else "",

@@ -33,6 +33,7 @@ class ExportTask:
         registrations: The registration of each camera, by camera name.
         clocks: The clocks of all cameras.
         keyframes: The selected keyframes of each camera, by camera name.
+        links: What the tracks of each camera's video show about its paths, by camera name.
         merge: The skeleton's motion; None if there is no motion.
         failure: The reason why the skeleton that the job asks for is missing; None if no skeleton is missing.
         segments: For each body segment with several cameras, the names of these cameras.
@@ -45,6 +46,7 @@ class ExportTask:
     registrations: Mapping[str, ArtefactRef]
     clocks: ArtefactRef
     keyframes: Mapping[str, ArtefactRef]
+    links: Mapping[str, ArtefactRef]
     merge: ArtefactRef | None
     failure: str | None
     segments: tuple[tuple[str, ...], ...]
@@ -76,7 +78,11 @@ def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
         relative_poses=found.relative_poses(task.segments),
         take=task.take,
         videos=_video_facts(task.capture),
-        log={**scene.log, "reach": read_summary(task.clocks.path)["distances"]},
+        log={
+            **scene.log,
+            "reach": read_summary(task.clocks.path)["distances"],
+            "links": {name: read_summary(each.path)["links"] for name, each in task.links.items()},
+        },
     )
     export_results(inputs, task.options, context)
     metrics = json.loads((inputs.out_dir / "metrics.json").read_text(encoding="utf-8"))

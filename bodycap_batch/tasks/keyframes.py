@@ -9,16 +9,15 @@ from typing import TYPE_CHECKING
 from bodycap_batch.config.options import KeyframeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import CaptureRef, FileRef
-from bodycap_batch.tasks.loading import load_capture
+from bodycap_batch.tasks.loading import TRACKS, load_capture
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
 
 if TYPE_CHECKING:
     from bodycap_batch.capture import CaptureCamera
-    from bodycap_batch.core.arrays import BoolArray
+    from bodycap_batch.core.arrays import BoolArray, IntArray
     from bodycap_batch.model.lens_estimate import LensEstimate
     from bodycap_batch.model.point_tracks import PointTracks
     from bodycap_batch.model.rotation_chain import RotationChain
-    from bodycap_batch.model.scene import KeyframeSelection
     from bodycap_batch.telemetry.streams import CameraTelemetry
 
 
@@ -49,6 +48,8 @@ class KeyframesTask:
 
 def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> None:
     """Select the keyframes; store them with copies of decoded frames and notes for the user."""
+    import numpy as np
+
     from bodycap_batch.capture.damage import damage_notes
     from bodycap_batch.capture.kept import KEPT_NAME, FrameKeeper
     from bodycap_batch.capture.masks import without_regions
@@ -56,6 +57,7 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
     from bodycap_batch.keyframes import select_keyframes
     from bodycap_batch.model.copied_frames import copied_notes
     from bodycap_batch.model.frozen_frames import frozen_notes
+    from bodycap_batch.model.point_tracks import STORED_STEP
     from bodycap_batch.telemetry.camera_rates import relate_gyro
     from bodycap_batch.tracks import fixed_notes
 
@@ -73,7 +75,8 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
         moving = moving[selection.pictures.frames]
     selection = replace(selection, fixed_regions=regions, moving_regions=moving, lens=lens)
     copies = copied_notes(camera.times_ns, selection.pictures)
-    selection = replace(selection, rotation_chain=_rotation_chain(camera, shown, selection))
+    frames = np.arange(len(camera.times_ns)) if selection.pictures is None else selection.pictures.frames
+    selection = replace(selection, rotation_chain=_rotation_chain(camera, shown, frames))
     camera = camera.only(selection.pictures)
     if telemetry is not None:
         assert selection.matches is not None
@@ -81,6 +84,8 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
     if (kept := keeper.kept_frames()) is not None:
         write_dataclass(kept.only(selection.pictures), files, KEPT_NAME)
     write_dataclass(selection, files, "keyframes")
+    if shown.tracks is not None:
+        write_dataclass(shown.tracks.chosen(frames, STORED_STEP), files, TRACKS)
     notes = [f"{camera.name}: {note}" for note in [*copies, *damage_notes(camera, selection.damaged)]]
     notes += frozen_notes(camera.name, selection.frozen, camera.common_times_ns() / 1e9)
     notes += [*telemetry_notes, *fixed_notes(camera.name, regions)]
@@ -128,14 +133,18 @@ def regions_and_lens(camera: CaptureCamera, context: StageContext) -> TrackFindi
         if done % _PROGRESS_FRAMES == 0:
             context.progress(done, total, "frames searched for hands")
 
+    def show_lens(done: int, total: int) -> None:
+        context.check_cancelled()
+        context.progress(done, total, "steps to the lens")
+
     tracks = track_video(camera, show)
     if is_on(Mechanism.FIXED_REGIONS):
         regions = find_fixed_regions(tracks, camera.times_ns)
         record_act(Mechanism.FIXED_REGIONS, int(regions.any()))
     tracks = tracks.outside(regions)
-    context.progress(0, 0, "searching what moves by itself")
     if wants_lens:
-        lens = estimate_lens(tracks, camera.times_ns)
+        lens = estimate_lens(tracks, camera.times_ns, show_lens)
+    context.progress(0, 0, "searching what moves by itself")
     if is_on(Mechanism.MOVING_REGIONS) and (lens is not None or not camera.camera.refine):
         alone = find_moving_tracks(tracks, camera.camera if lens is None else lens.lens, camera.times_ns)
         found = find_moving_regions(tracks, alone)
@@ -144,16 +153,12 @@ def regions_and_lens(camera: CaptureCamera, context: StageContext) -> TrackFindi
         moving = found if is_enough else moving
         tracks = tracks.outside(found) if is_enough else tracks
         if lens is not None and is_enough:
-            lens = estimate_lens(tracks, camera.times_ns)
+            lens = estimate_lens(tracks, camera.times_ns, show_lens)
     return TrackFindings(fixed=regions, moving=moving, lens=lens, tracks=tracks)
 
 
-def _rotation_chain(
-    camera: CaptureCamera, shown: TrackFindings, selection: KeyframeSelection
-) -> RotationChain | None:
+def _rotation_chain(camera: CaptureCamera, shown: TrackFindings, frames: IntArray) -> RotationChain | None:
     """Return how the camera turns; None if its lens or its tracks are unknown."""
-    import numpy as np
-
     from bodycap_batch.core.mechanisms import Mechanism, is_on
     from bodycap_batch.tracks import measure_rotation_chain
 
@@ -161,7 +166,6 @@ def _rotation_chain(
     if shown.tracks is None or not known or not is_on(Mechanism.CONTINUITY):
         return None
     lens, sigma = (camera.camera, 0.0) if shown.lens is None else (shown.lens.lens, shown.lens.focal_sigma)
-    frames = np.arange(len(camera.times_ns)) if selection.pictures is None else selection.pictures.frames
     return measure_rotation_chain(shown.tracks, lens, sigma, frames)
 
 

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 CLOCKS_NAME = "clocks"
 """Name of the file, without suffix, that holds the clocks of a capture."""
 
+TRACKS = "tracks"
+"""Name of the file, without suffix, that holds the tracks of a camera's video."""
+
 
 def load_capture(
     capture: CaptureRef,

@@ -12,6 +12,7 @@ from bodycap_batch.tasks.fill import FILL
 from bodycap_batch.tasks.further import FURTHER_MAPS, FURTHER_POSES
 from bodycap_batch.tasks.inertial import INERTIAL
 from bodycap_batch.tasks.keyframes import KEYFRAMES
+from bodycap_batch.tasks.links import LINKS
 from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE
 from bodycap_batch.tasks.merge import MERGE
 from bodycap_batch.tasks.places import PLACES
@@ -41,6 +42,7 @@ STAGES: Mapping[str, Stage[Any]] = {
         INERTIAL,
         FURTHER_MAPS,
         FURTHER_POSES,
+        LINKS,
         MERGE,
         FILL,
         EXPORT,

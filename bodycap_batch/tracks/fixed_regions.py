@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, IntArray
+from bodycap_batch.core.percent import format_percent
 from bodycap_batch.model.optical_flow import Pixels, pixel_scale
 from bodycap_batch.model.point_tracks import PointTracks
 
@@ -45,8 +46,8 @@ def fixed_notes(camera: str, regions: BoolArray) -> list[str]:
     if not regions.any():
         return []
     return [
-        f"{camera}: {regions.mean():.0%} of the picture is fixed to the camera (for example the own hand, or "
-        "the rim of a lens) and is left out"
+        f"{camera}: {format_percent(float(regions.mean()))} of the picture is fixed to the camera (for "
+        "example the own hand, or the rim of a lens) and is left out"
     ]
 
 

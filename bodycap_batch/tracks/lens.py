@@ -7,7 +7,9 @@ pairs of a video have the same lens. Evidence: docs/decisions/tracks.md.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import count
 
 import numpy as np
 
@@ -97,7 +99,9 @@ _Poses = tuple[FloatArray, FloatArray]
 """Rotations (P,3,3) and unit translations (P,3) of the second frames of the pairs from the first frames."""
 
 
-def estimate_lens(tracks: PointTracks, times_ns: IntArray) -> LensEstimate | None:
+def estimate_lens(
+    tracks: PointTracks, times_ns: IntArray, progress: Callable[[int, int], None] | None = None
+) -> LensEstimate | None:
     """Estimate focal length and radial distortion of a camera.
 
     The readout times along both axes of the picture are estimated with the lens, because a rolling shutter
@@ -106,6 +110,7 @@ def estimate_lens(tracks: PointTracks, times_ns: IntArray) -> LensEstimate | Non
     Args:
         tracks: Tracks in the room.
         times_ns: (N,) times of the frames, nanoseconds.
+        progress: Receives the number of finished steps and of all steps.
 
     Returns:
         The lens; None if there are too few pairs of frames with motion.
@@ -118,7 +123,13 @@ def estimate_lens(tracks: PointTracks, times_ns: IntArray) -> LensEstimate | Non
     if len(pairs) < _MIN_PAIRS:
         return None
     problem = _Problem.create(tracks, times_ns, pairs)
-    solutions = [_solve(problem, shared, poses) for shared, poses in _search(problem)]
+    steps, total = count(1), len(_DISTORTIONS) * len(_FOCAL_RATIOS) + _CANDIDATES * _ROUNDS * _JOINT_STEPS
+
+    def step() -> None:
+        if progress is not None:
+            progress(next(steps), total)
+
+    solutions = [_solve(problem, shared, poses, step) for shared, poses in _search(problem, step)]
     best = min(solutions, key=lambda each: each.cost.sum())
     rng = np.random.default_rng(_SEED)
     equations = [each.linearised(problem, _JOINT_DAMPING) for each in solutions]
@@ -136,7 +147,7 @@ def estimate_lens(tracks: PointTracks, times_ns: IntArray) -> LensEstimate | Non
     )
 
 
-def _search(problem: _Problem) -> list[tuple[_Shared, _Poses]]:
+def _search(problem: _Problem, step: Callable[[], None]) -> list[tuple[_Shared, _Poses]]:
     """Return the best of a wide range of lenses, and the relative poses of the pairs with each of them."""
     width_px, height_px = problem.size_px
     long_side = max(width_px, height_px)
@@ -160,6 +171,7 @@ def _search(problem: _Problem) -> list[tuple[_Shared, _Poses]]:
             cost, poses = problem.cost(rays, [rays.start_by_rotation(), *anchors, *before])
             own.append((float(cost.sum()), shared, poses))
             before = [poses]
+            step()
         for _, shared, poses in sorted(own, key=lambda item: item[0])[:_BEST_FOCAL]:
             for distortion in distortions:
                 bent = make(model, shared.lens.focal_px, distortion)
@@ -273,7 +285,7 @@ class _Linearised:
         return np.asarray(np.clip(change, -_MAX_CHANGE, _MAX_CHANGE))
 
 
-def _solve(problem: _Problem, shared: _Shared, poses: _Poses) -> _Solution:
+def _solve(problem: _Problem, shared: _Shared, poses: _Poses, step: Callable[[], None]) -> _Solution:
     """Fit lens, readout times and relative poses together, by steps of Levenberg and Marquardt."""
     best = _Solution.create(problem, shared, poses)
     for _ in range(_ROUNDS):
@@ -289,6 +301,7 @@ def _solve(problem: _Problem, shared: _Shared, poses: _Poses) -> _Solution:
                 best, damping = found, damping / 10.0
             else:
                 damping *= 10.0
+            step()
     return best
 
 

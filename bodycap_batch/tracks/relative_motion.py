@@ -23,6 +23,8 @@ _MIN_MATCHES = 12
 """Minimum number of inliers of a measurement."""
 _MIN_CELLS = 8
 """Minimum number of grid cells with an inlier: a twelfth of the picture."""
+_NEARLY_ALL = 0.9
+"""Share of the matches that shows a motion without a search for others. Evidence: none."""
 _TRIALS = 200
 """Number of random samples of each search."""
 _REFINEMENTS = 8
@@ -78,8 +80,11 @@ class Motion:
         return float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(self.rotation_covariance)[-1])))
 
 
-def measure_rotation(matches: RayMatches) -> Motion | None:
+def measure_rotation(matches: RayMatches, expected: FloatArray | None = None) -> Motion | None:
     """Measure the relative rotation of two frames; None if the matches do not determine it.
+
+    If nearly all matches follow the motion that a refinement finds from the `expected` rotation (3,3), no
+    other motion can have more, so none is looked for.
 
     The rotation with the support of most grid cells is taken, so that a textured hand does not outvote a
     plain room by its number of features.
@@ -88,6 +93,10 @@ def measure_rotation(matches: RayMatches) -> Motion | None:
     """
     if len(matches.first) < _MIN_MATCHES:
         return None
+    if expected is not None and np.isfinite(expected).all():
+        near = refine_motion(matches, expected)
+        if np.count_nonzero(near.inliers) >= _NEARLY_ALL * len(matches.first):
+            return usable(near)
     starts = [_turn_hypothesis(matches), *_essential_hypotheses(matches)]
     found = [refine_motion(matches, start) for start in starts]
     return usable(max(found, key=lambda each: (each.support, np.count_nonzero(each.inliers))))

@@ -258,6 +258,7 @@ NAMES = (
     "inertial",
     "further_maps",
     "further_poses",
+    "links",
     "merge",
     "fill",
     "export",

@@ -203,7 +203,7 @@ def test_a_terminal_gets_one_line_for_the_job(bench: Bench) -> None:
         assert process.wait(60) == 0
     assert b"\x1b[" in text
     assert "━" in text.decode()
-    assert b"100%" in text
+    assert b"100 %" in text
     assert b"done in " in text
 
 
@@ -432,4 +432,4 @@ def test_evaluate_aligns_all_cameras_together_and_counts_lost_frames(
     assert main(["evaluate", str(tmp_path / "mine"), str(tmp_path), "--reference", "torso"]) == 0
     text = capfd.readouterr().out
     assert "left_palm from torso: 50 frames" in text
-    assert "50.0%" in text
+    assert "50.0 %" in text

@@ -77,7 +77,7 @@ def test_modules_of_later_stages_load_while_a_core_is_idle(bench: Bench, threads
         executor=children,
     )
     run_job(bench.job(skeleton=skeleton), out_dir=bench.out, settings=settings)
-    later = {"registration", "clocks", "export", "report"} | (
+    later = {"registration", "clocks", "links", "export", "report"} | (
         {"merge", "fill"} if skeleton != "none" else set()
     )
     wanted = {name for stage in later for name in STAGES[stage].modules}

@@ -134,7 +134,7 @@ def shown(events: list[Event], monkeypatch: pytest.MonkeyPatch, error: Exception
 
 def test_a_finished_job_leaves_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     (line,) = shown(run_of(), monkeypatch).splitlines()
-    assert " 100%  done in " in line
+    assert " 100 %  done in " in line
 
 
 def test_the_current_tasks_stand_below_the_line_of_the_job(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from bodycap_batch.cli.look import _StoredMarks
-from bodycap_batch.pipeline import Settings, stored_for_report
+from bodycap_batch.core.errors import StoreError
+from bodycap_batch.pipeline import Settings, remake_report, stored_for_report
 from bodycap_batch.store.artefacts import Store
 from tests.pipeline.test_run import CAMERAS, Bench
 
@@ -49,3 +50,17 @@ def test_an_empty_store_gives_no_marks_and_one_message(
     assert marks("torso", 0) == []
     assert marks("torso", 60) == []
     assert capsys.readouterr().err.count("only over the pictures in the report") == 1
+
+
+def test_the_report_of_results_of_other_options_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An update of the program changes the keys of the stages as other options do."""
+    bench = Bench(tmp_path, monkeypatch)
+    bench.run()
+    before = (bench.out / "report.html").read_bytes()
+    job = bench.job(merge={"max_gap_s": 0.5})
+    with pytest.raises(StoreError, match=r"their report stays as it is: these stages .* merge"):
+        remake_report(job, out_dir=bench.out, settings=looking(bench))
+    assert (bench.out / "report.html").read_bytes() == before
+    assert not (bench.out / "partial").exists()

@@ -34,7 +34,8 @@ def test_results_that_are_not_good_enough_are_written_and_exit_with_6(films: Ben
     assert out.splitlines()[-1] == f"results: {results}"
     assert (results / "run.json").is_file()
     assert (
-        "the result is usable with care with 100.0% of the recording, but good with 90.0% is required" in err
+        "the result is usable with care with 100.0 % of the recording, but good with 90.0 % is required"
+        in err
     )
     assert "The cause: Metric scale (sizes are known to about" in err
     for enough in ("usable,0.9", "usable", "poor, 1"):
@@ -119,8 +120,8 @@ def test_the_camera_that_is_missing_is_the_cause() -> None:
     assert unmet_requirement(None, summary, Path("out")) is None
     unmet = unmet_requirement("good,0.9", summary, Path("out"))
     assert unmet is not None
-    assert "good with 70.0% of the recording, but good with 90.0% is required" in unmet.message
-    assert unmet.message.endswith("The cause: left_palm has 40.0% of its frames")
+    assert "good with 70.0 % of the recording, but good with 90.0 % is required" in unmet.message
+    assert unmet.message.endswith("The cause: left_palm has 40.0 % of its frames")
     spans = [
         LostSpan(camera="left_palm", from_s=at, to_s=at + frames, frames=frames, cause=cause)
         for at, frames, cause in ((0.0, 2, LossCause.BLUR), (3.0, 4, LossCause.PLAIN))
@@ -129,7 +130,7 @@ def test_the_camera_that_is_missing_is_the_cause() -> None:
         "good,0.9", summarise(values, judge(values, None, spans).to_dict()), Path("out")
     )
     assert unmet is not None
-    assert unmet.message.endswith("left_palm has 40.0% of its frames: plain surfaces")
+    assert unmet.message.endswith("left_palm has 40.0 % of its frames: plain surfaces")
 
 
 def test_a_joint_that_was_rarely_measured_is_the_cause() -> None:
@@ -145,8 +146,8 @@ def test_a_joint_that_was_rarely_measured_is_the_cause() -> None:
     }
     unmet = unmet_requirement("good,0.9", summarise(values), Path("out"))
     assert unmet is not None
-    assert "75.0% of the recording" in unmet.message
-    assert unmet.message.endswith("LeftHand was measured in 50.0% of the motion")
+    assert "75.0 % of the recording" in unmet.message
+    assert unmet.message.endswith("LeftHand was measured in 50.0 % of the motion")
 
 
 def test_any_failure_outranks_an_unmet_requirement() -> None:

@@ -231,6 +231,7 @@ def test_garbage_is_what_no_finished_job_used(alone: Bench) -> None:
         "map",
         "registration",
         "clocks",
+        "links",
         "merge",
         "fill",
         "export",

@@ -27,9 +27,9 @@ def test_a_run_ends_with_the_verdict_its_reasons_and_the_file_to_open(films: Ben
     assert code == 0, err
     results = films.folder / "out" / "my_walk"
     assert out.splitlines() == [
-        "verdict: poor. The cameras are good (100.0% of the frames), but the motion is poor. Sizes are known "
-        "to about ± 8 cm of body height (5.0%): put a board of printed squares on the floor, or measure how "
-        "far the person walks, or stand in a T-pose for two seconds first.",
+        "verdict: poor. The cameras are good (100.0 % of the frames), but the motion is poor. Sizes are "
+        "known to about ± 8 cm of body height (5.0 %): put a board of printed squares on the floor, or "
+        "measure how far the person walks, or stand in a T-pose for two seconds first.",
         "  poor: Distance between cameras and body: 5.0 cm for camera torso (95th percentile)",
         "measured: chest, left hand",
         "not measured: hips, head, both arms, right hand, both legs, both feet",
@@ -61,4 +61,4 @@ def test_the_status_of_a_watched_job_has_the_verdict(
     assert bench.status("walk")["verdict"]["grade"] == "poor"
     assert main(["status"]) == 0
     (line,) = [line for line in capfd.readouterr().out.splitlines() if line.startswith("walk")]
-    assert "poor     The cameras are good (100.0% of the frames), but the motion is poor." in line
+    assert "poor     The cameras are good (100.0 % of the frames), but the motion is poor." in line

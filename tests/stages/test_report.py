@@ -190,7 +190,7 @@ def test_a_share_below_one_is_never_shown_as_100_percent(inputs: ReportInputs, t
         entry["coverage"] = 0.9997
     metrics["mapping"]["reach"]["within_reach"] = 0.99999
     text = written(replace(inputs, metrics=metrics), tmp_path)
-    assert "99.9%" in text
+    assert "99.9 %" in text
     coverage = re.findall(r'data-metric="[^"]*coverage"[^>]*>([^<]*)<', text)
     assert len(coverage) == 5  # the first figures, and the table of three cameras and their sum
     assert not any("100.0" in each for each in coverage)
@@ -512,7 +512,7 @@ def test_distances_beyond_the_reach_at_any_scale_are_graded_poor(inputs: ReportI
         "distances": 120,
         "within_reach": 0.62,
         "keyframes_out_of_reach": 0,
-        "reason": "for no scale, 80% of the distances between cameras are possible on one body",
+        "reason": "for no scale, 80 % of the distances between cameras are possible on one body",
     }
     (found,) = [each for each in judge(metrics, None).criteria if each.name == "Distances between cameras"]
     assert found.grade is Grade.POOR
@@ -588,7 +588,7 @@ def test_the_page_shows_scale_hinges_soft_limits_and_joined_maps(
         "7.10 mm",
         "4.3 cm",
         "± 1.3 cm",
-        "-1.2%",
+        "-1.2 %",
         "90°",
     ):
         assert says in text
@@ -773,7 +773,7 @@ def test_a_given_skeleton_is_not_recommended_again(
     changed = with_merge(inputs, scale=scale)
     (found,) = [each for each in advice(changed) if "sizes" in each.reason]
     assert ("--skeleton" in found.how) is is_recommended
-    assert found.reason == "sizes are known to about ± 5 cm of body height (3.0%)"
+    assert found.reason == "sizes are known to about ± 5 cm of body height (3.0 %)"
     assert "board of printed squares" in found.action
 
 

@@ -25,21 +25,11 @@ def rotation_from_angles(axes: str, angles_rad: FloatArray) -> FloatArray:
     Returns:
         The rotations (T,3,3). They are the identity for K = 0.
     """
+    from scipy.spatial.transform import Rotation
+
     out = np.broadcast_to(np.eye(3), (len(angles_rad), 3, 3)).copy()
     for column, axis in enumerate(axes):
-        out = out @ _elementary_rotation("XYZ".index(axis), angles_rad[:, column])
-    return out
-
-
-def _elementary_rotation(axis: int, angle_rad: FloatArray) -> FloatArray:
-    """Return the rotations (T,3,3) about one axis (0 is X, 1 is Y, 2 is Z) by angles (T,), radians."""
-    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    out = np.zeros((len(angle_rad), 3, 3))
-    out[:, axis, axis] = 1.0
-    out[:, first, first] = out[:, second, second] = cos
-    out[:, second, first] = sin
-    out[:, first, second] = -sin
+        out = out @ Rotation.from_euler(axis, angles_rad[:, [column]]).as_matrix()
     return out
 
 

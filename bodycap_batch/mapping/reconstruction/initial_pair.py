@@ -11,6 +11,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray, evenly_spaced
 from bodycap_batch.core.errors import JobError
+from bodycap_batch.core.percent import format_percent
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, read_image_ids
 from bodycap_batch.model.camera import Camera
@@ -82,7 +83,7 @@ class InitialPair:
                 "of parallax)"
             )
         if self.coverage < _MIN_COVERAGE:
-            return f"the matches cover only {self.coverage:.0%} of the images"
+            return f"the matches cover only {format_percent(self.coverage)} of the images"
         return f"there were too few matches ({self.matches}), or their geometry was too weak"
 
     def to_log(self) -> dict[str, object]:

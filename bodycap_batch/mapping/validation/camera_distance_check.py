@@ -12,6 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, runs
+from bodycap_batch.core.percent import format_percent
 from bodycap_batch.model.scene import Map
 
 Reach = Mapping[tuple[str, str], tuple[float, float]]
@@ -78,8 +79,8 @@ class DistanceCheck:
         }
         if not self.is_conclusive:
             out["reason"] = (
-                f"for no scale, {MIN_WITHIN_REACH:.0%} of the distances between cameras are possible on "
-                "one body"
+                f"for no scale, {format_percent(MIN_WITHIN_REACH)} of the distances between cameras are "
+                "possible on one body"
             )
         return out
 

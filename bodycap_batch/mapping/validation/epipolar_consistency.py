@@ -12,6 +12,7 @@ import numpy as np
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.core.percent import format_percent
 from bodycap_batch.mapping.matching.database import DATABASE_NAME
 from bodycap_batch.mapping.validation.near_pairs import NO_TIMES, NearPairs
 from bodycap_batch.model.optical_flow import pixel_scale
@@ -186,8 +187,8 @@ def check_consistency(ratio: float) -> EstimationError | None:
     if ratio <= MAX_INCONSISTENT_RATIO:
         return None
     return EstimationError(
-        f"{ratio:.0%} of the matches between keyframes contradict the map: different places that look the "
-        f"same (repeated pictures, tiles, windows) were mapped as one place",
+        f"{format_percent(ratio)} of the matches between keyframes contradict the map: different places that "
+        "look the same (repeated pictures, tiles, windows) were mapped as one place",
         hint="film objects that are different in each place, or cover repeated pictures; check the "
         "calibration",
     )
@@ -214,7 +215,7 @@ def check_coverage(
         return None
     return EstimationError(
         f"the map contains only {registered} of {keyframes} keyframes, {textured} of which show texture; it "
-        f"must contain at least {options.min_coverage:.0%} of these; the map was started from these pairs of "
-        f"keyframes: {attempts}",
+        f"must contain at least {format_percent(options.min_coverage)} of these; the map was started "
+        f"from these pairs of keyframes: {attempts}",
         hint="move the cameras sideways past bright surfaces with texture; check the calibration",
     )

@@ -12,6 +12,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import EstimationError, JobError
+from bodycap_batch.core.percent import format_percent
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.merging.cameras.track import MIN_SIGMA_M
 from bodycap_batch.model.geometry import Similarity
@@ -74,7 +75,7 @@ def known_distance(
     if distance**2 <= _MIN_SIGNAL_TO_NOISE**2 * variance:
         raise EstimationError(
             f"the camera positions in the frames {first} and {second} are too close to each other: the "
-            f"uncertainty is {np.sqrt(variance) / max(distance, 1e-12):.0%} of their distance",
+            f"uncertainty is {format_percent(np.sqrt(variance) / max(distance, 1e-12))} of their distance",
             hint="choose two frames in which the camera positions are farther apart",
         )
     sigma = np.sqrt(variance / distance**2 + 2.0 * (MIN_SIGMA_M / metres) ** 2 + _MIN_SIGMA**2)

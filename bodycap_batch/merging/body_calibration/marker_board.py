@@ -12,6 +12,7 @@ import numpy as np
 from bodycap_batch.config.options import MarkerBoard
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.core.percent import format_percent
 from bodycap_batch.merging.body_calibration.samples import MAP_ERROR_DURATION_S, MAP_ERROR_M
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
 from bodycap_batch.merging.world.vertical import VerticalHypothesis
@@ -143,9 +144,9 @@ def locate_board(
     sigma = float(np.hypot(spread, _MIN_SIGMA))
     if not sigma < _MAX_SIGMA:
         raise EstimationError(
-            f"the scale from the marker board has an uncertainty of {sigma:.0%}, which is too large: its "
-            f"{len(seen.map_from_cam)} views are from nearly the same place, or the poses of these views "
-            "contradict each other",
+            f"the scale from the marker board has an uncertainty of {format_percent(sigma)}, which is too "
+            f"large: its {len(seen.map_from_cam)} views are from nearly the same place, or the poses of "
+            "these views contradict each other",
             hint="walk past the board, so that the cameras see the board from several sides; or leave out "
             "merge.marker_board",
         )

@@ -115,14 +115,21 @@ def draw_camera_timeline(
     for curve in curves:
         parts.append(_draw_curve(curve, times, span_s, top, columns))
         top += _CURVE_HEIGHT + _MARGIN
-    parts.append(draw_axis(span_s, top))
+    return draw_strip(parts, span_s, top, f"{camera} over time: {_summary(path)}")
+
+
+def draw_strip(
+    parts: list[str], span_s: tuple[float, float], top: float, title: str, kind: str = "strip"
+) -> str:
+    """Return an image of rows above a time axis at the height `top`, with a mark of the shown time."""
+    parts.append(_draw_axis(span_s, top))
     parts.append(element("line", class_="now", x1=LEFT, x2=LEFT, y1=2.0, y2=top))
     return svg_image(
         WIDTH,
         top + 18.0,
         "".join(parts),
-        f"{camera} over time: {_summary(path)}",
-        class_="strip",
+        title,
+        class_=kind,
         data_left=LEFT,
         data_width=WIDTH - LEFT - RIGHT,
         data_start=f"{span_s[0]:.6f}",
@@ -373,7 +380,7 @@ def _range_path(x: FloatArray, y: FloatArray) -> str:
     return "".join(f"M{number(x[i])} {number(y[i, 0])}V{number(y[i, 2])}" for i in np.flatnonzero(visible))
 
 
-def draw_axis(span_s: tuple[float, float], top: float) -> str:
+def _draw_axis(span_s: tuple[float, float], top: float) -> str:
     """Draw the labels of a time axis.
 
     Args:

@@ -15,9 +15,9 @@ from bodycap_batch.report.figures.camera_timeline import (
     RIGHT,
     WIDTH,
     column_count,
-    draw_axis,
+    draw_strip,
 )
-from bodycap_batch.report.figures.svg import element, path_through, svg_image, text
+from bodycap_batch.report.figures.svg import element, path_through, text
 
 _CURVE_HEIGHT, _BAR_HEIGHT, _MARGIN = 46.0, 13.0, 12.0
 """Height of a curve, of a bar and of the space between them, SVG units."""
@@ -86,19 +86,8 @@ def draw_motion_curves(takes: Sequence[Take], span_s: tuple[float, float], detai
             label = f"{foot.name.split()[0]} stands" + (f", {take.name}" if len(takes) > 1 else "")
             parts.append(_draw_bar(label, foot, take, span_s, top, number))
             top += _BAR_HEIGHT + 5.0
-    parts.append(draw_axis(span_s, top))
-    parts.append(element("line", class_="now", x1=LEFT, x2=LEFT, y1=2.0, y2=top))
-    return svg_image(
-        WIDTH,
-        top + 18.0,
-        "".join(parts),
-        "Joint angles, foot contacts and floor clearance over time",
-        class_="strip motion",
-        data_left=LEFT,
-        data_width=WIDTH - LEFT - RIGHT,
-        data_start=f"{span_s[0]:.6f}",
-        data_end=f"{span_s[1]:.6f}",
-    )
+    title = "Joint angles, foot contacts and floor clearance over time"
+    return draw_strip(parts, span_s, top, title, "strip motion")
 
 
 def _rows(motion: Motion) -> list[_Row]:

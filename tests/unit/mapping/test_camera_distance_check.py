@@ -105,4 +105,4 @@ def test_a_map_that_contradicts_its_pairs_is_refused() -> None:
     assert check_consistency(0.05) is None
     error = check_consistency(inconsistent_match_ratio(pairs))
     assert error is not None
-    assert re.search(r"30% .* look the same", error.message)
+    assert re.search(r"30 % .* look the same", error.message)

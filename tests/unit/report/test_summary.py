@@ -67,9 +67,11 @@ def test_the_headline_names_the_size_and_what_makes_it_known() -> None:
     }
     headline = summarise(values).headline
     assert headline.startswith(
-        "The cameras are good (100.0% of the frames), but the motion is usable with care."
+        "The cameras are good (100.0 % of the frames), but the motion is usable with care."
     )
-    assert "Sizes are known to about ± 10 cm of body height (6.0%): give the height of the person" in headline
+    assert (
+        "Sizes are known to about ± 10 cm of body height (6.0 %): give the height of the person" in headline
+    )
 
 
 def test_what_is_missing_costs_coverage_and_no_grade() -> None:
@@ -84,7 +86,7 @@ def test_what_is_missing_costs_coverage_and_no_grade() -> None:
     assert (found["share"], found["frames"], found["frames_delivered"]) == (0.7, 20, 14)
     assert found["cameras"]["left_palm"]["seconds_delivered"] == 0.8
     assert found["seconds"] is None, "the duration of one video is not known"
-    assert "(70.0% of the frames; left_palm 40.0%)" in verdict.headline
+    assert "(70.0 % of the frames; left_palm 40.0 %)" in verdict.headline
 
 
 @pytest.mark.parametrize(

@@ -184,6 +184,7 @@ HASHED = {
         ("further_maps", "further_poses"),
         CAMERAS | {"mapping", "registration", "inertial", "telemetry"},
     ),
+    "links": CAMERAS | {"evaluate", "tracks"},
     # Merging reads marker boards from the images, and explains a failure by mirrored cameras.
     "merge": BODY | {"merging", "calibration", "mapping"},
     "fill": BODY | {"fill"},

@@ -30,6 +30,7 @@ from bodycap_batch.tasks.further import FurtherMapsTask, FurtherPosesTask
 from bodycap_batch.tasks.inertial import InertialTask
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, FileRef, MountInput, StatedClock
 from bodycap_batch.tasks.keyframes import KeyframesTask
+from bodycap_batch.tasks.links import LinksTask
 from bodycap_batch.tasks.mapping import ExtendTask, MapTask, RefineTask
 from bodycap_batch.tasks.merge import BoardFootage, MergeTask
 from bodycap_batch.tasks.places import PlacesTask
@@ -124,6 +125,7 @@ def tasks(folder: Path) -> dict[str, Any]:
             map=scene_map,
             registration=scene_map,
         ),
+        "links": LinksTask(keyframes=scene_map, map=scene_map, registration=scene_map),
         "sound": SoundTask(
             capture=capture,
         ),
@@ -155,6 +157,7 @@ def tasks(folder: Path) -> dict[str, Any]:
             registrations=stored,
             clocks=scene_map,
             keyframes=stored,
+            links=stored,
             merge=None,
             failure="too few frames",
             segments=(("torso", "head"),),

@@ -54,8 +54,11 @@ def test_the_lens_of_a_camera_that_turns_is_found_within_its_uncertainty(
     model: str, focal_px: float, distortion: float, readout_s: float
 ) -> None:
     """A rolling shutter bends the lines of sight. Without its readout time, the error was 10 % at 20 ms."""
-    found = estimate_lens(tracks_of(camera(model, focal_px, distortion), readout_s=readout_s), TIMES_NS)
+    steps = list[tuple[int, int]]()
+    tracks = tracks_of(camera(model, focal_px, distortion), readout_s=readout_s)
+    found = estimate_lens(tracks, TIMES_NS, lambda done, total: steps.append((done, total)))
     assert found is not None
+    assert steps == [(number, len(steps)) for number in range(1, len(steps) + 1)]
     assert found.is_determined
     assert found.lens.model == model
     assert found.focal_sigma < 0.03
