@@ -103,7 +103,7 @@ def test_the_second_run_has_nothing_to_do(bench: Bench) -> None:
     bench.run("run", "my walk")
     code, out, _ = bench.run("run", "my walk")
     assert code == 0
-    assert "nothing to do, because all 13 stages were already done" in out
+    assert "nothing to do, because all 15 stages were already done" in out
 
 
 def test_a_child_starts_ahead_if_there_are_no_results(bench: Bench) -> None:

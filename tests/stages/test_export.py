@@ -371,7 +371,7 @@ def test_a_motion_that_reads_back_differently_is_refused(
         local[10, 3] = local[10, 3] @ so3_exp([np.deg2rad(0.02), 0.0, 0.0])
         write_bvh(path, replace(motion, local_rotation=local), **options)
 
-    monkeypatch.setattr("bodycap_batch.export.motion_files.write_bvh", wrong)
+    monkeypatch.setattr("bodycap_batch.export.result_files.write_bvh", wrong)
     with pytest.raises(StoreError, match="differs from the solved motion"):
         export_results(inputs, ExportOptions(formats=("bvh",)), StageContext(work_dir=tmp_path))
     assert not (inputs.out_dir / "motion.bvh").exists()
