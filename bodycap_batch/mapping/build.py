@@ -238,7 +238,6 @@ def build_map_once(
     refused = add_flip_hint(check_coverage(models, len(refs), textured, attempts, options), flips)
     if refused is not None and not models:
         raise refused
-    count = len(models)
     models, displaced = with_models_of_rest(
         models,
         {ref.name for ref in refs},
@@ -250,7 +249,7 @@ def build_map_once(
     misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
     removed = [name for step in ("repair", "placed") if step in log for name in log[step]["cut"]]
     misplaced = misplaced_frames(
-        [*removed, *log.get("contradicting", ()), *displaced], models[:1] if len(models) > count else models
+        [*removed, *log.get("contradicting", ()), *displaced], models[:1] if displaced else models
     )
     if readouts:
         log["readouts_from_matches"] = {name: asdict(item) for name, item in sorted(readouts.items())}

@@ -124,7 +124,6 @@ def extend_map(
         # A removed keyframe may have connected others with the room.
         transient += remove_points_on_wearer(models[number])
     models.sort(key=model_order)
-    count = len(models)
     models, displaced = with_models_of_rest(
         models,
         {ref.name for ref in (*existing, *new)},
@@ -145,9 +144,7 @@ def extend_map(
     ]
     diagnostics = replace(
         diagnostics,
-        misplaced=misplaced_frames(
-            [*before, *removed, *displaced], models[:1] if len(models) > count else models
-        ),
+        misplaced=misplaced_frames([*before, *removed, *displaced], models[:1] if displaced else models),
         extensions=(*diagnostics.extensions, entry),
         details={**diagnostics.details, "keyframes": len(existing) + len(new)},
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ from bodycap_batch.config.lost_frames import LEAST_MAPPED
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.core.mechanisms import Mechanism, is_on
 from bodycap_batch.mapping.mapping_context import MappingContext
+from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.model_files import keyframe_names, model_order
 from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
 from bodycap_batch.mapping.results import finalise_models
@@ -18,7 +20,7 @@ from bodycap_batch.mapping.validation.repair import remove_without_adjustment
 def with_models_of_rest(
     models: Sequence[Any], names: set[str], contradicted: float, mapping: MappingContext
 ) -> tuple[list[Any], set[str]]:
-    """Add models of the keyframes that are in none, if these are more than the largest model has.
+    """Add a model of the keyframes that are in none, if it is larger than the largest model.
 
     Then the first keyframes were too few or too far apart, or the largest model contradicts most of them. If
     it also contradicts itself, places that look the same are in it, and nothing is added.
@@ -30,15 +32,25 @@ def with_models_of_rest(
         mapping: Workspace, mapper options, and how each camera turns.
 
     Returns:
-        The models, the largest first. The image names of the keyframes of the model that was the largest, if
-        another one is the largest now; else empty.
+        The models, the largest first. The image names of those keyframes of the model that was the largest
+        whose camera has more keyframes in the added one: they contradict the map of their camera.
     """
     rest = names - set[str]().union(*map(keyframe_names, models))
     is_base = not contradicted and is_on(Mechanism.FURTHER_MAPS)
     if not models or not is_base or len(rest) <= models[0].num_reg_images():
         return list(models), set()
-    found = sorted([*models, *models_of_rest(rest, mapping)], key=model_order)
-    return found, set() if found[0] is models[0] else keyframe_names(models[0])
+    found = min(models_of_rest(rest, mapping), key=model_order, default=models[0])
+    if model_order(found) >= model_order(models[0]):
+        return list(models), set()
+    before, now = _cameras_of(models[0]), _cameras_of(found)
+    moved = {camera for camera in before if now[camera] > before[camera]}
+    displaced = {name for name in keyframe_names(models[0]) if ImageRef.parse(name).camera in moved}
+    return [found, *models], displaced
+
+
+def _cameras_of(model: Any) -> Counter[str]:
+    """Return the number of keyframes of each camera in a model."""
+    return Counter(ImageRef.parse(name).camera for name in keyframe_names(model))
 
 
 def models_of_rest(names: set[str], mapping: MappingContext) -> list[Any]:
