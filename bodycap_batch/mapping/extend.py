@@ -39,7 +39,7 @@ from bodycap_batch.mapping.reconstruction.model_files import (
     registered_ids,
     write_models,
 )
-from bodycap_batch.mapping.rest_models import with_models_of_rest
+from bodycap_batch.mapping.rest_models import with_model_of_rest
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
 from bodycap_batch.mapping.validation.repair import remove_without_adjustment
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
@@ -124,7 +124,7 @@ def extend_map(
         # A removed keyframe may have connected others with the room.
         transient += remove_points_on_wearer(models[number])
     models.sort(key=model_order)
-    models, displaced = with_models_of_rest(
+    models, displaced = with_model_of_rest(
         models,
         {ref.name for ref in (*existing, *new)},
         max(contradicted),

@@ -17,7 +17,7 @@ from bodycap_batch.mapping.results import finalise_models
 from bodycap_batch.mapping.validation.repair import remove_without_adjustment
 
 
-def with_models_of_rest(
+def with_model_of_rest(
     models: Sequence[Any], names: set[str], contradicted: float, mapping: MappingContext
 ) -> tuple[list[Any], set[str]]:
     """Add a model of the keyframes that are in none, if it is larger than the largest model.

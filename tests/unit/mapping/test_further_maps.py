@@ -68,6 +68,7 @@ def test_a_map_that_most_keyframes_do_not_join_gives_way_to_a_map_of_these(tmp_p
     result = extend_map(capture, first, {}, MapOptions(), context)
     frames = [sorted(item.keyframe_frame.tolist()) for item in result.maps]
     assert frames == [list(range(3, KEYFRAMES)), [0, 1, 2]]
+    assert result.diagnostics.misplaced == {"cam": (0, 1, 2)}
 
 
 @pytest.mark.parametrize("turned_from", [None, 11])
