@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.projection import Projection, project_motion
+from bodycap_batch.merging.projection.project import Projection, project_motion
 from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
 from bodycap_batch.model.merge_data import MergeResult, SolvedBody

@@ -56,7 +56,7 @@ from bodycap_batch.merging.graph.motion_graph import (
     posture_deviations,
 )
 from bodycap_batch.merging.graph.windows import MAX_ITERATIONS, max_window_ticks, solve_windows
-from bodycap_batch.merging.projection import project_motion
+from bodycap_batch.merging.projection.project import project_motion
 from bodycap_batch.merging.reporting.report import MotionFacts, build_report
 from bodycap_batch.merging.unfit_camera import merge_without_unfit_camera
 from bodycap_batch.merging.world.floor import (

@@ -31,7 +31,8 @@ _STANDING_RATE_HZ = 30.0
 SLIP_HUBER_SIGMAS = 2.0
 """Threshold of the Huber loss for the movement of a standing foot, in sigmas.
 
-A larger movement is treated as slipping. Evidence: none.
+A larger movement is treated as slipping. The motion graph and the projection to a rigid skeleton use the same
+threshold. Evidence: none.
 """
 
 
@@ -184,7 +185,7 @@ class MergeResult(SolvedBody):
     kept only to compute figures about the solution of the graph.
 
     Attributes:
-        motion: The motion of the skeleton with rigid bones, with the rotations of the solution of the graph.
+        motion: The motion of the skeleton with rigid bones that is nearest to the solution of the graph.
         projection_gap: Differences between `motion` and the solution of the graph, as JSON values: distances
             from the joints of the graph, distances from the cameras, and the sliding speed of standing feet.
         world_from_map: By gauge, the similarity from the map to the world. A gauge with an unknown similarity

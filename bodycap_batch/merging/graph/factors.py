@@ -103,8 +103,7 @@ class JointFactors:
         bones: The graph's bones.
         hinges: The graph's hinges.
         prior_scale: Factor on the sigmas of the rotation prior.
-        slack_m: Slack of a joint: sigma of its gap, metres. The sigma of a hinge is proportional to it.
-        gap_m: Sigma of the gap, if it is not the slack, metres.
+        slack_m: Slack of a joint: sigma of its gap, metres.
     """
 
     def __init__(
@@ -114,7 +113,6 @@ class JointFactors:
         *,
         prior_scale: float = 1.0,
         slack_m: float = JOINT_SLACK_M,
-        gap_m: float | None = None,
     ) -> None:
         self._hinges = hinges
         self._children = [(index, bone) for index, bone in enumerate(bones) if bone.parent >= 0]
@@ -122,8 +120,7 @@ class JointFactors:
             index: gtsam.Pose3(gtsam.Rot3(bone.mean_rotation), bone.offset_m)
             for index, bone in self._children
         }
-        gap_m = slack_m if gap_m is None else gap_m
-        self._noise = {index: _joint_noise(bone, prior_scale, gap_m) for index, bone in self._children}
+        self._noise = {index: _joint_noise(bone, prior_scale, slack_m) for index, bone in self._children}
         self._hinge_noises = [
             gtsam.noiseModel.Isotropic.Sigma(1, float(np.hypot(HINGE_SLACK_RATIO * slack_m, hinge.sigma_m)))
             for hinge in hinges
@@ -143,10 +140,10 @@ class JointFactors:
                 graph.add(gtsam.RangeFactorWithTransformPose3(upper, following, hinge.range_m, noise, anchor))
 
 
-def _joint_noise(bone: Bone, prior_scale: float, gap_m: float) -> Any:
+def _joint_noise(bone: Bone, prior_scale: float, slack_m: float) -> Any:
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = prior_scale**2 * bone.rotation_covariance
-    covariance[3:, 3:] = gap_m**2 * np.eye(3)
+    covariance[3:, 3:] = slack_m**2 * np.eye(3)
     return gtsam.noiseModel.Gaussian.Covariance(covariance)
 
 

@@ -40,10 +40,6 @@ ON_TICK_TOLERANCE_NS = 1_000_000
 """Maximum time (nanoseconds) between a measurement and a tick whose state the measurement uses. A measurement
 at a larger distance gets a separate state. In a millisecond, a hand at 3 m/s moves 3 mm."""
 
-_GAP_M = 0.001
-"""Sigma (metres) of the gap at a joint. The skeleton of the result has no gaps, and takes only the rotations
-of this graph. Evidence: docs/decisions/merging.md."""
-
 _TOLERANCE = 1e-4
 """Minimum relative decrease of the error per step. The solver stops after a smaller decrease. Convergence is
 quadratic: after such a step, joints move by less than 0.1 mm."""
@@ -241,7 +237,7 @@ class MotionGraph:
 
     def _add_joints(self) -> None:
         before = self._graph.size()
-        joints = JointFactors(self._bones, hinges(self._skeleton, tuple(self._bones)), gap_m=_GAP_M)
+        joints = JointFactors(self._bones, hinges(self._skeleton, tuple(self._bones)))
         for tick in range(len(self._times)):
             joints.add(self._graph, tick)
         self._factor_counts["joints"] = int(self._graph.size() - before)

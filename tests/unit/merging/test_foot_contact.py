@@ -15,10 +15,12 @@ from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.merging.graph.foot_contact import FootContact, contacts_in_window, find_contacts
+from bodycap_batch.merging.projection.project import _standing_joints
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.skeleton_presets import load_skeleton
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.posed import posed
+from tests.bodies import merged, reaching
 
 FPS, COUNT, STAND = 30.0, 60, 25
 TICKS = np.round(np.arange(COUNT) * 1e9 / FPS).astype(np.int64)
@@ -96,9 +98,13 @@ def test_sliding_costs_the_same_at_every_rate(shin, fps):
         UP,
         ticks,
     )
+    result, _ = merged(reaching(10))
+    standing = np.zeros(result.observed.shape, dtype=bool)
+    standing[:, skeleton.index_of_role("LeftLeg")] = True
+    (planted,) = _standing_joints(replace(result, fps=fps, standing=standing))
     # The cost of sliding by 2 cm in a second; at 30 ticks per second, sigma is 0.05 m/s.
-    cost = fps * (0.02 / fps / found.sigma_m) ** 2
-    assert cost == pytest.approx(30.0 * (0.02 / 0.05) ** 2, rel=1e-3)
+    costs = [fps * (0.02 / fps / sigma_m) ** 2 for sigma_m in (found.sigma_m, planted.sigma_m)]
+    assert costs == pytest.approx([30.0 * (0.02 / 0.05) ** 2] * 2, rel=1e-3)
 
 
 def test_contacts_reduce_sliding_in_the_solved_motion(tmp_path):

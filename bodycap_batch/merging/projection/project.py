@@ -1,21 +1,30 @@
-"""Project the solved motion onto the rigid skeleton.
+"""Project the solved motion onto a rigid skeleton.
 
 In the motion graph the joints have some slack, so bones can shift by millimetres. In a rigid motion only the
-root shifts, and all other joints only rotate. The rigid motion has the rotations of the motion graph.
+root shifts, and all other joints only rotate. This module estimates a rigid motion that is close to the
+camera poses and to the motion graph. It also requires that the difference between the rigid motion and the
+motion graph changes slowly over time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.merging.projection.rigid_motion_solver import (
+    CameraTarget,
+    ProjectionProblem,
+    RigidMotion,
+    StandingJoint,
+    solve_rigid_motion,
+)
 from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import invert, poses_at, rotation_angle_rad
-from bodycap_batch.model.merge_data import SolvedBody
+from bodycap_batch.model.merge_data import SolvedBody, standing_sigma_m
 from bodycap_batch.model.skeleton import Motion, forward_kinematics
 
 _MAX_GAP_INTERVALS = 1.6
@@ -63,13 +72,49 @@ def project_motion(
             fraction of the image height. With a rolling shutter, the time of a pose depends on this row.
 
     Returns:
-        The rigid motion at the ticks of `body`, and its differences from the motion graph.
+        The rigid motion at the ticks of `body`, and its differences from the motion graph. Joints that the
+        graph did not solve keep their local rotations.
     """
-    motion = rigid_motion(body)
-    return Projection(motion=motion, gap=_gap(body, motion, _camera_poses(body, clocks, row_fraction or {})))
+    problem = projection_problem(body, clocks, row_fraction)
+    result = solve_rigid_motion(problem, initial_motion(body))
+    motion = Motion(
+        skeleton=body.skeleton,
+        fps=body.fps,
+        start_ns=body.start_ns,
+        root_in_world_m=result.root,
+        local_rotation=result.local,
+        observed=body.observed,
+    )
+    return Projection(motion=motion, gap=_gap(body, motion, problem.cameras))
 
 
-def rigid_motion(body: SolvedBody) -> Motion:
+def projection_problem(
+    body: SolvedBody,
+    clocks: Mapping[str, CameraClock],
+    row_fraction: Mapping[str, FloatArray] | None = None,
+) -> ProjectionProblem:
+    """Return the least-squares problem that `project_motion` solves.
+
+    Args:
+        body: The solution of the motion graph.
+        clocks: By camera, its clock.
+        row_fraction: By camera, (N,) mean image row of the observations of each of the N frames, as a
+            fraction of the image height.
+
+    Returns:
+        The terms of the problem.
+    """
+    return ProjectionProblem(
+        fps=body.fps,
+        skeleton=body.skeleton,
+        solved=np.flatnonzero(body.solved),
+        world_from_joint=body.graph_world_from_joint,
+        cameras=_camera_targets(body, clocks, row_fraction or {}),
+        standing=_standing_joints(body),
+    )
+
+
+def initial_motion(body: SolvedBody) -> RigidMotion:
     """Return the rigid motion that has the joint rotations of the motion graph.
 
     Each solved joint has one centre in the rigid motion and one centre in the motion graph. At each tick, the
@@ -77,46 +122,38 @@ def rigid_motion(body: SolvedBody) -> Motion:
 
     Args:
         body: The solution of the motion graph.
+
+    Returns:
+        The initial motion of the least-squares problem.
     """
     skeleton, solved = body.skeleton, body.solved
     rotation = body.graph_world_from_joint[..., :3, :3]
     local = rotation.copy()
-    parents = skeleton.parents[1:]
-    local[:, 1:] = np.swapaxes(rotation[:, parents], -1, -2) @ rotation[:, 1:]
+    for joint in range(1, len(skeleton.joints)):
+        local[:, joint] = np.swapaxes(rotation[:, skeleton.parents[joint]], -1, -2) @ rotation[:, joint]
     centres = forward_kinematics(skeleton, np.zeros((len(local), 3)), local)[..., :3, 3]
     used = solved if solved.any() else np.ones(len(solved), dtype=bool)
-    return Motion(
-        skeleton=skeleton,
-        fps=body.fps,
-        start_ns=body.start_ns,
-        root_in_world_m=(body.graph_world_from_joint[:, used][..., :3, 3] - centres[:, used]).mean(axis=1),
-        local_rotation=local,
-        observed=body.observed,
+    root = (body.graph_world_from_joint[:, used][..., :3, 3] - centres[:, used]).mean(axis=1)
+    return RigidMotion(root=root, local=local)
+
+
+def _standing_joints(body: SolvedBody) -> tuple[StandingJoint, ...]:
+    """Return the ankles of all feet that stand on the floor at two or more successive ticks."""
+    if body.standing is None:
+        return ()
+    held = body.standing[1:] & body.standing[:-1]
+    sigma_m = standing_sigma_m(body.fps)
+    return tuple(
+        StandingJoint(joint=int(joint), held=held[:, joint], sigma_m=sigma_m)
+        for joint in np.flatnonzero(held.any(axis=0))
     )
 
 
-class _CameraPoses(NamedTuple):
-    """The poses of one camera's path in the world, at T ticks.
-
-    Attributes:
-        camera: Camera name.
-        joint: Index of the joint at which the camera's bone starts.
-        joint_from_cam: (4,4) mount of the camera.
-        world_from_cam: (T,4,4) camera poses in the world, metres.
-        found: (T,) True for the ticks with a camera pose.
-    """
-
-    camera: str
-    joint: int
-    joint_from_cam: FloatArray
-    world_from_cam: FloatArray
-    found: BoolArray
-
-
-def _camera_poses(
+def _camera_targets(
     body: SolvedBody, clocks: Mapping[str, CameraClock], row_fraction: Mapping[str, FloatArray]
-) -> Iterator[_CameraPoses]:
-    """Yield the poses of each worn camera's path, interpolated at the ticks of the motion."""
+) -> tuple[CameraTarget, ...]:
+    """Return the poses of each camera's path in the world, interpolated at the ticks of the motion."""
+    out = []
     mounts = {mount.camera: mount for mount in body.mounts}
     for trajectory in body.trajectories:
         localised = np.flatnonzero(trajectory.localised)
@@ -140,10 +177,19 @@ def _camera_poses(
             max_gap_ns=round(_MAX_GAP_INTERVALS * float(interval)),
             snap_ns=_SNAP_NS,
         )
-        yield _CameraPoses(trajectory.camera, joint, mount.joint_from_cam, poses, found)
+        out.append(
+            CameraTarget(
+                camera=trajectory.camera,
+                joint=joint,
+                joint_from_cam=mount.joint_from_cam,
+                world_from_cam=poses,
+                found=found,
+            )
+        )
+    return tuple(out)
 
 
-def _gap(body: SolvedBody, motion: Motion, cameras: Iterator[_CameraPoses]) -> dict[str, Any]:
+def _gap(body: SolvedBody, motion: Motion, cameras: tuple[CameraTarget, ...]) -> dict[str, Any]:
     """Return the differences between the rigid motion and the solution of the graph (`Projection.gap`)."""
     exported = motion.world_from_joint()
     out: dict[str, Any] = {}
@@ -151,33 +197,35 @@ def _gap(body: SolvedBody, motion: Motion, cameras: Iterator[_CameraPoses]) -> d
         graph, rigid = body.graph_world_from_joint[:, body.solved], exported[:, body.solved]
         out["joints"] = _pose_difference(graph, rigid)
     out["cameras"] = {
-        each.camera: _pose_difference(
-            each.world_from_cam[each.found], exported[each.found, each.joint] @ each.joint_from_cam
+        target.camera: _pose_difference(
+            target.world_from_cam[target.found],
+            exported[target.found, target.joint] @ target.joint_from_cam,
         )
-        for each in cameras
-        if each.found.any()
+        for target in cameras
+        if target.found.any()
     }
     if body.standing is not None:
-        held = body.standing[1:] & body.standing[:-1]
         out["feet"] = {
-            body.skeleton.joints[joint]: _slide_speed(exported[:, joint, :3, 3], held[:, joint], body.fps)
-            for joint in np.flatnonzero(held.any(axis=0)).tolist()
+            body.skeleton.joints[standing.joint]: _slide_speed(
+                exported[:, standing.joint, :3, 3], standing, body.fps
+            )
+            for standing in _standing_joints(body)
         }
     return out
 
 
-def _slide_speed(centre: FloatArray, held: BoolArray, fps: float) -> dict[str, float]:
+def _slide_speed(centre: FloatArray, standing: StandingJoint, fps: float) -> dict[str, float]:
     """Return the percentiles of an ankle's speed while its foot stands.
 
     Args:
         centre: (T,3) centres of the ankle in the world, metres.
-        held: (T-1,) True if the foot stands at a tick and at the next one.
+        standing: The ticks at which the foot stands.
         fps: Number of ticks per second.
 
     Returns:
         The median and the 95th percentile of the speed, metres per second.
     """
-    speed = fps * np.linalg.norm(np.diff(centre, axis=0), axis=1)[held]
+    speed = fps * np.linalg.norm(np.diff(centre, axis=0), axis=1)[standing.held]
     return {f"slide_p{q}_m_per_s": float(np.percentile(speed, q)) for q in (50, 95)}
 
 
