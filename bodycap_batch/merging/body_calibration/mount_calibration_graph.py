@@ -225,19 +225,28 @@ class CalibrationGraph:
             },
             first_joint_factor=self._first_joint_factor,
             t_pose=self._samples.posture.t_pose,
+            named_mounts=self._named_mounts(),
         )
 
     def measurement_factors(self, camera: int) -> IntArray:
         """Return the factor indices (N,4) of a camera's N measured poses. Each pose has four factors."""
-        first = 0
-        for other in range(camera):
-            first += POINTS_PER_MOUNT + POINTS_PER_MOUNT * int(self._samples.valid[other].sum())
-        first += POINTS_PER_MOUNT  # the camera's mount prior
+        first = self._prior_factors()[camera] + POINTS_PER_MOUNT
         count = int(self._samples.valid[camera].sum())
         return np.asarray(
             first + POINTS_PER_MOUNT * np.arange(count)[:, None] + np.arange(POINTS_PER_MOUNT),
             dtype=np.int64,
         )
+
+    def _prior_factors(self) -> IntArray:
+        """Return the index (C,) of the first factor of each camera's mount prior."""
+        counts = POINTS_PER_MOUNT * (1 + self._samples.valid.sum(axis=1))
+        return np.asarray(np.cumsum(counts) - counts, dtype=np.int64)
+
+    def _named_mounts(self) -> IntArray:
+        """Return the indices of the factors of mount rotations that only the camera's name gives."""
+        named = np.array([self._priors[name].by_name for name in self._samples.cameras], dtype=bool)
+        # The first factor of a prior is for the centre, the others are for the rotation.
+        return np.asarray((self._prior_factors()[named][:, None] + np.arange(1, POINTS_PER_MOUNT)).ravel())
 
     def _set_rest_bones(self, bones: tuple[Bone, ...], repetitions: float) -> None:
         """Set the bones, and reduce the weight of their hinges.

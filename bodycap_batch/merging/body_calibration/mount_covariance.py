@@ -26,6 +26,7 @@ from bodycap_batch.merging.graph.error_modes import (
 )
 from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.merging.graph.linearisation import LinearisedGraph
+from bodycap_batch.model.nominal_mounts import NOMINAL_ERROR_RAD, NOMINAL_SIGMA_RAD
 
 JOINT_PRIOR_SCALE = 4.0
 """Factor on the sigmas of the joint rotation priors in the calibration graph.
@@ -57,6 +58,7 @@ class LinearisedCalibration:
             to the 12 unknowns of the mount. The perturbation is a rotation, then a translation.
         first_joint_factor: Index of the first joint factor in the graph.
         t_pose: (K,) True for the ticks in a T-pose.
+        named_mounts: Indices of the factors of mount rotations that only the camera's name gives.
     """
 
     linear: LinearisedGraph
@@ -66,6 +68,7 @@ class LinearisedCalibration:
     mount_jacobian: Mapping[str, FloatArray]
     first_joint_factor: int
     t_pose: BoolArray
+    named_mounts: IntArray
 
     def reduced(self, common_jacobian: FloatArray | None = None) -> ReducedSystem:
         """Eliminate the bone poses of all ticks, so that only the unknowns of the mounts remain.
@@ -122,11 +125,13 @@ class LinearisedCalibration:
 
         The graph uses joint rotation priors with widened sigmas. The result restores the original sigmas,
         reduced to the transient part, because only this part differs between samples. A T-pose has a prior of
-        its own.
+        its own. The rotations of named mounts have wider priors than their expected error, too.
         """
         out = np.ones(self.linear.matrix.shape[0])
         rows = self.rotation_rows(np.flatnonzero(~self.t_pose))
         out[rows] = (TRANSIENT_SHARE / JOINT_PRIOR_SCALE) ** 2
+        named = self.linear.first_row[self.named_mounts][:, None] + np.arange(3)
+        out[named] = (NOMINAL_ERROR_RAD / NOMINAL_SIGMA_RAD) ** 2
         return out
 
     def posture_bias_jacobian(self) -> Any:

@@ -16,11 +16,13 @@ from bodycap_batch.merging.body_calibration.calibration_covariance import (
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.cameras.track import make_track
+from bodycap_batch.merging.graph.factors import mount_keys
 from bodycap_batch.merging.map_alignment.align import align_cameras
 from bodycap_batch.merging.map_alignment.initial_alignment import align_map
 from bodycap_batch.model.geometry import Similarity, so3_exp
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.joining import run_case
+from tests.bench.posed import posed
 from tests.bench.simulation import ARMS, PALMS
 from tests.calibrations import calibration_of
 from tests.stages.walker import ROLES, make_inputs, make_walk, record
@@ -125,6 +127,25 @@ def test_errors_that_samples_share_do_not_count_in_an_alignment():
     assert_allclose(found.sigma_map, np.sqrt(samples.white_noise_share) * samples.sigma_map)
     assert_allclose(found.sigma_rad, np.sqrt(samples.white_noise_share) * samples.sigma_rad)
     assert found.white_noise_share == 1.0
+
+
+def test_a_mount_that_its_camera_names_is_known_better_than_its_prior_says(arms):
+    """Without it, calibrated palms had the sigma of uncalibrated ones, and their paths were not followed."""
+    samples, calibration, metric = arms
+    inputs = posed(SynthOptions(seconds=1.0, cameras=ARMS, poses_only=True)).inputs
+    calibration.solve(metric)
+    mounts = calibration.linearised()
+    of_mounts = np.abs(mounts.row_variances() - 1.0 / 3.0) < 1e-9
+    # 15 degrees an axis against 15 in all; three differences of three rows for each of five cameras.
+    assert of_mounts.sum() == 5 * 9
+    assert mounts.linear.matrix[of_mounts][:, : mounts.linear.columns[mount_keys(0)[0]]].nnz == 0
+    # A job that knows it to 20 degrees only has said so, and no name.
+    told = {
+        mount.camera: replace(mount, sigma_rad=np.radians(20.0), by_name=False) for mount in inputs.mounts
+    }
+    stated = CalibrationGraph(inputs.skeleton, mounts.body.bones, samples, told, metric, lambda: None)
+    stated.solve(metric, iterations=1)
+    assert not (np.abs(stated.linearised().row_variances() - 1.0 / 3.0) < 1e-9).any()
 
 
 @pytest.mark.slow
