@@ -86,6 +86,11 @@ def test_frames_metrics_and_motion_agree(folder: Path) -> None:
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["partial"] is False
     assert metrics["total"]["frames"] == sum(FRAMES.values())
+    for name, links in metrics["mapping"]["links"].items():
+        # The tracks of the video hold points of every second frame.
+        assert 0.4 * FRAMES[name] < links[0]["compared"]
+        assert links[0]["contradicted"] == 0
+    assert metrics["mapping"]["links"].keys() == FRAMES.keys()
     motion = read_bvh(out / "motion.bvh")[1]
     assert motion is not None
     assert np.isfinite(motion.local_rotation).all()

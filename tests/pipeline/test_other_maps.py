@@ -85,3 +85,13 @@ def test_the_pictures_are_compared_with_the_frames_of_both_maps(
     # Frames of different maps are not compared with each other. Each map alone has its rotations confirmed.
     assert outcome["rotations"]["wrong"] == outcome["positions"]["wrong"] == 0
     assert outcome["rotations"]["right"] > 2 * max(LENGTHS)
+
+
+def test_the_tracks_of_the_video_are_compared_with_both_maps(results: Path) -> None:
+    metrics = json.loads((results.parent / "out" / "metrics.json").read_text())
+    links = metrics["mapping"]["links"]["torso"]
+    assert [each["frame"] for each in links] == [each["frame"] for each in metrics["models"]]
+    for each, length in zip(links, LENGTHS, strict=True):
+        # Every second frame has stored points.
+        assert 0.4 * length < each["compared"] <= 0.5 * length + 1
+        assert each["contradicted"] == 0
