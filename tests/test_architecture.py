@@ -42,7 +42,7 @@ SUBLAYERS: dict[str, Sequence[set[str]]] = {
         {"validation", "initial_models"},
         {"inputs", "model_joining"},
         {"results"},
-        {"rest_models"},
+        {"unmapped_keyframes"},
         {"build", "extend", "further_maps", "refine"},
     ),
     "registration": ({"tracking"}, {"poses"}, {"recovery"}, {"stage"}, {"further_maps"}),

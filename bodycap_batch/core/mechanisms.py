@@ -56,6 +56,7 @@ class Mechanism(StrEnum):
     GAP_FILLING = "gap_filling"
     SENSOR_PATH = "sensor_path"
     FURTHER_MAPS = "further_maps"
+    LARGER_MODEL = "larger_model"
     CONTINUITY = "continuity"
     MOUNT_SLIPS = "mount_slips"
     LYING = "lying"

@@ -49,8 +49,8 @@ from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.model_joining import join_models
 from bodycap_batch.mapping.reconstruction.mapper_options import MIN_RESECTION_INLIERS
 from bodycap_batch.mapping.reconstruction.model_files import write_models
-from bodycap_batch.mapping.rest_models import with_model_of_rest
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
+from bodycap_batch.mapping.unmapped_keyframes import with_larger_model
 from bodycap_batch.mapping.validation.epipolar_consistency import check_consistency, check_coverage
 from bodycap_batch.mapping.validation.remaining_keyframes import resect_remaining
 from bodycap_batch.mapping.validation.repair import left_contradicted, remove_without_adjustment, repair_model
@@ -238,7 +238,7 @@ def build_map_once(
     refused = add_flip_hint(check_coverage(models, len(refs), textured, attempts, options), flips)
     if refused is not None and not models:
         raise refused
-    models, displaced = with_model_of_rest(
+    models, displaced = with_larger_model(
         models,
         {ref.name for ref in refs},
         max(log["repair"]["contradicted_share"], ratio),

@@ -39,8 +39,8 @@ from bodycap_batch.mapping.reconstruction.model_files import (
     registered_ids,
     write_models,
 )
-from bodycap_batch.mapping.rest_models import with_model_of_rest
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
+from bodycap_batch.mapping.unmapped_keyframes import with_larger_model
 from bodycap_batch.mapping.validation.repair import remove_without_adjustment
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.scene import MapResult
@@ -124,7 +124,7 @@ def extend_map(
         # A removed keyframe may have connected others with the room.
         transient += remove_points_on_wearer(models[number])
     models.sort(key=model_order)
-    models, displaced = with_model_of_rest(
+    models, displaced = with_larger_model(
         models,
         {ref.name for ref in (*existing, *new)},
         max(contradicted),

@@ -21,7 +21,7 @@ from bodycap_batch.mapping.matching.database import (
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
 from bodycap_batch.mapping.reconstruction.conversion import map_from_reconstruction
 from bodycap_batch.mapping.reconstruction.model_files import model_order
-from bodycap_batch.mapping.rest_models import models_of_rest
+from bodycap_batch.mapping.unmapped_keyframes import reconstruct_unmapped
 from bodycap_batch.model.scene import Map, MapResult, Trajectory
 
 
@@ -82,7 +82,7 @@ def _further_maps(
     calibrated_ids = calibrated_camera_ids(capture, ids)
     mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, SKELETAL_ABOVE)
     mapping = mapping.with_rotation_chains(capture)
-    models = models_of_rest(left, mapping)
+    models = reconstruct_unmapped(left, mapping)
     readouts = readouts_of_maps(previous.maps)
     return [
         map_with_readouts(map_from_reconstruction(model, workspace), readouts)

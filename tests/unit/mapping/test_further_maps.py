@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,15 +14,16 @@ import pytest
 from bodycap_batch.capture import Capture
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping import extend_map, map_lost_keyframes
+from bodycap_batch.mapping import extend_map, map_lost_keyframes, unmapped_keyframes
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.inputs import make_mapping_context
 from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.matching.pair_matching import match_pairs
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
-from bodycap_batch.mapping.reconstruction.model_files import write_models
+from bodycap_batch.mapping.reconstruction.model_files import keyframe_names, write_models
 from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
 from bodycap_batch.mapping.results import make_result
+from bodycap_batch.mapping.unmapped_keyframes import with_larger_model
 from bodycap_batch.model.geometry import so3_exp, so3_log
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.rotation_chain import RotationChain
@@ -48,7 +51,11 @@ def match_frames(workspace: Path, frames: Iterable[int], context: StageContext) 
     match_pairs(workspace, pairs, {"cam": CameraIntrinsics(LENS, calibrated=True)}, context)
 
 
-def test_a_map_that_most_keyframes_do_not_join_gives_way_to_a_map_of_these(tmp_path: Path) -> None:
+@pytest.mark.parametrize("contradicted", [0.0, 0.1])
+def test_a_map_that_most_keyframes_do_not_join_gives_way_to_a_map_of_these(
+    contradicted: float, tmp_path: Path
+) -> None:
+    """A map that contradicts itself does not: places that look the same are in it."""
     earlier, work = tmp_path / "earlier", tmp_path / "work"
     earlier.mkdir()
     work.mkdir()
@@ -62,13 +69,42 @@ def test_a_map_that_most_keyframes_do_not_join_gives_way_to_a_map_of_these(tmp_p
     settings.image_names = [ImageRef("cam", frame).name for frame in range(3)]
     models, _ = reconstruct(earlier, settings, context, 3)
     write_models(earlier, models)
-    diagnostics = MapDiagnostics(details={"keyframes": KEYFRAMES})
+    repair = {"contradicted_share": contradicted}
+    diagnostics = MapDiagnostics(details={"keyframes": KEYFRAMES, "repair": repair})
     first = make_result(models, earlier, diagnostics.to_log())
     assert [item.keyframe_frame.tolist() for item in first.maps] == [[0, 1, 2]]
     result = extend_map(capture, first, {}, MapOptions(), context)
     frames = [sorted(item.keyframe_frame.tolist()) for item in result.maps]
-    assert frames == [list(range(3, KEYFRAMES)), [0, 1, 2]]
-    assert result.diagnostics.misplaced == {"cam": (0, 1, 2)}
+    if contradicted:
+        assert frames == [[0, 1, 2]]
+        assert result.diagnostics.misplaced == {}
+    else:
+        assert frames == [list(range(3, KEYFRAMES)), [0, 1, 2]]
+        assert result.diagnostics.misplaced == {"cam": (0, 1, 2)}
+
+
+def test_only_cameras_with_more_keyframes_in_the_larger_model_are_displaced(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def model(**counts: int) -> Any:
+        names = {ImageRef(name, frame).name for name, count in counts.items() for frame in range(count)}
+        images = dict(enumerate(sorted(names)))
+        return SimpleNamespace(
+            num_reg_images=lambda: len(images),
+            num_points3D=lambda: 100,
+            reg_image_ids=lambda: list(images),
+            image=lambda number: SimpleNamespace(name=images[number]),
+        )
+
+    first, found = model(head=4, palm=2), model(palm=8)
+    monkeypatch.setattr(unmapped_keyframes, "reconstruct_unmapped", lambda *_: [found])
+    rest = {ImageRef("palm", frame).name for frame in range(20, 30)}
+    inside = keyframe_names(first)
+    models, displaced = with_larger_model([first], inside | rest, 0.0, cast(Any, None))
+    assert models == [found, first]
+    # The head keeps its map: all of its keyframes are in the first model.
+    assert displaced == {ImageRef("palm", 0).name, ImageRef("palm", 1).name}
+    assert with_larger_model([found], keyframe_names(found) | rest, 0.0, cast(Any, None))[0] == [found]
 
 
 @pytest.mark.parametrize("turned_from", [None, 11])

@@ -1,4 +1,4 @@
-"""Models of the keyframes that are in no other model."""
+"""Models of the keyframes that no model contains yet."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from bodycap_batch.config.lost_frames import LEAST_MAPPED
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.core.mechanisms import Mechanism, is_on
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.model_files import keyframe_names, model_order
@@ -17,7 +17,7 @@ from bodycap_batch.mapping.results import finalise_models
 from bodycap_batch.mapping.validation.repair import remove_without_adjustment
 
 
-def with_model_of_rest(
+def with_larger_model(
     models: Sequence[Any], names: set[str], contradicted: float, mapping: MappingContext
 ) -> tuple[list[Any], set[str]]:
     """Add a model of the keyframes that are in none, if it is larger than the largest model.
@@ -35,13 +35,14 @@ def with_model_of_rest(
         The models, the largest first. The image names of those keyframes of the model that was the largest
         whose camera has more keyframes in the added one: they contradict the map of their camera.
     """
-    rest = names - set[str]().union(*map(keyframe_names, models))
-    is_base = not contradicted and is_on(Mechanism.FURTHER_MAPS)
-    if not models or not is_base or len(rest) <= models[0].num_reg_images():
+    unmapped = names - set[str]().union(*map(keyframe_names, models))
+    is_base = not contradicted and is_on(Mechanism.LARGER_MODEL)
+    if not models or not is_base or len(unmapped) <= models[0].num_reg_images():
         return list(models), set()
-    found = min(models_of_rest(rest, mapping), key=model_order, default=models[0])
+    found = min(reconstruct_unmapped(unmapped, mapping), key=model_order, default=models[0])
     if model_order(found) >= model_order(models[0]):
         return list(models), set()
+    record_act(Mechanism.LARGER_MODEL)
     before, now = _cameras_of(models[0]), _cameras_of(found)
     moved = {camera for camera in before if now[camera] > before[camera]}
     displaced = {name for name in keyframe_names(models[0]) if ImageRef.parse(name).camera in moved}
@@ -53,7 +54,7 @@ def _cameras_of(model: Any) -> Counter[str]:
     return Counter(ImageRef.parse(name).camera for name in keyframe_names(model))
 
 
-def models_of_rest(names: set[str], mapping: MappingContext) -> list[Any]:
+def reconstruct_unmapped(names: set[str], mapping: MappingContext) -> list[Any]:
     """Return models of keyframes that are in no other model, until too few are left for a further one."""
     left, models = set(names), list[Any]()
     while len(left) >= LEAST_MAPPED:
