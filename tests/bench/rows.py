@@ -33,10 +33,13 @@ class Row:
     reference: str | None = None
 
 
+SHARED = ("tum_fr1_xyz", "walk12", "room12", "walk131", "room131")
+"""Shared captures with truth in the table of `make bench`."""
+
+
 def rows_in(data: Path, lab: Path, work: Path) -> list[Row]:
     """Return the captures that exist."""
-    rows = [row_of(data / "tum_fr1_xyz")]
-    rows += [row_of(data / name) for name in ("walk12", "room12", "walk131", "room131")]
+    rows = [row_of(data / name) for name in SHARED]
     rows.append(Row("cpl_lab", REPOSITORY / "jobs" / "cpl_lab.yaml", lab / "gt", (), "torso"))
     true_mounts = work / "cpl_lab_true_mounts.yaml"
     if (lab / "gt" / "mounts.json").exists():

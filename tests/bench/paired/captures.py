@@ -12,7 +12,7 @@ from pathlib import Path
 import av
 import yaml
 
-from tests.bench.rows import DATA, LAB, row_of, rows_in
+from tests.bench.rows import DATA, SHARED, row_of
 
 VIDEOS = (".mp4", ".mov", ".mkv")
 CALIBRATION = "calib.json"
@@ -56,8 +56,7 @@ class BenchCapture:
 
 def shared_captures(data: Path = DATA) -> list[BenchCapture]:
     """Return the shared captures that exist, with truth or without."""
-    rows = [row for row in rows_in(data, LAB, Path()) if row.capture.is_dir()]
-    rows += [row_of(data / name) for name in _MORE_SHARED if (data / name).is_dir()]
+    rows = [row_of(data / name) for name in (*SHARED, *_MORE_SHARED) if (data / name).is_dir()]
     out = [
         BenchCapture(
             name=row.name,
