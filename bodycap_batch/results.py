@@ -43,6 +43,8 @@ _KINDS = {
 class CameraPath:
     """The path of one camera: a pose for each of its N frames, NaN for lost frames.
 
+    A frame with the status ROTATION_ONLY has a rotation, and NaN as its position. It is not localised.
+
     Attributes:
         frames: Number, time, status and sigma of each frame.
         frame_of_reference: ``world`` (metres, Z up, floor at z = 0), or the name of the gauge of a map, whose
@@ -197,7 +199,7 @@ class Result:
         unplaced = folder / _UNPLACED / name
         poses = read_tum(unplaced if unplaced.is_file() else folder / name)
         world_from_cam = np.full((len(table.status), 4, 4), np.nan)
-        posed = np.flatnonzero(table.localised)
+        posed = np.flatnonzero(table.localised | table.rotation_only)
         if not np.array_equal(table.times_ns[posed], poses.times_ns):
             raise JobError(
                 f"frames.csv and the trajectory of {table.camera} do not have the same frames",
@@ -205,6 +207,7 @@ class Result:
                 hint="one of the files was changed or comes from another run; run the job again",
             )
         world_from_cam[posed] = poses.world_from_cam
+        world_from_cam[table.rotation_only, :3, 3] = np.nan
         return CameraPath(frames=table, frame_of_reference=frame_of_reference, world_from_cam=world_from_cam)
 
     def motion(self) -> BodyMotion:

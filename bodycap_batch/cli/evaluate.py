@@ -234,6 +234,8 @@ def _camera_line(name: str, score: dict[str, Any]) -> str:
     frames = "?" if score["frames"] is None else str(score["frames"])
     share = "?" if score["coverage"] is None else format_percent(score["coverage"], 1)
     line = f"{name:14}{frames:>8}{score['registered']:>8}{share:>8}"
+    if score["ate_m"] is None and score["rotation_deg"] is not None:
+        return f"{line}{'rotation only':>22}{score['rotation_deg']['rmse']:>11.3f}"
     if score["ate_m"] is None:
         return f"{line}  no truth"
     line += f"{100 * score['ate_m']['rmse']:>10.3f}{100 * score['ate_m']['max']:>8.2f}{'':4}"

@@ -57,6 +57,7 @@ class Mechanism(StrEnum):
     SENSOR_PATH = "sensor_path"
     FURTHER_MAPS = "further_maps"
     LARGER_MODEL = "larger_model"
+    MERE_TURN = "mere_turn"
     CONTINUITY = "continuity"
     MOUNT_SLIPS = "mount_slips"
     LYING = "lying"

@@ -63,7 +63,7 @@ def read_delivered(results: Path) -> dict[str, DeliveredCamera]:
     Paths in other maps are in folders of ``trajectories/``. Cameras without a pose are left out.
 
     Raises:
-        JobError: The folder holds no paths, or a file is malformed.
+        JobError: The folder holds no paths or no map, or a file is malformed.
     """
     files = sorted((results / "trajectories").rglob("*.tum"))
     if not files:
@@ -76,6 +76,11 @@ def read_delivered(results: Path) -> dict[str, DeliveredCamera]:
     for file in files:
         if len((path := read_tum(file)).times_ns):
             paths[file.stem].append(path)
+    if paths and not lenses:
+        raise JobError(
+            f"{results} holds rotations without a map, so there is no lens to compare them with pictures",
+            hint="compare them with true rotations: bodycap evaluate RESULT TRUTH",
+        )
     readouts = _readouts(results / "metrics.json")
     return {
         name: DeliveredCamera(

@@ -16,7 +16,14 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.formats.tum import TimedPoses, read_tum
-from bodycap_batch.model.geometry import Similarity, align_points, invert, poses_at, rotation_angle_rad
+from bodycap_batch.model.geometry import (
+    Similarity,
+    align_points,
+    invert,
+    nearest_rotation,
+    poses_at,
+    rotation_angle_rad,
+)
 
 _SNAP_NS = 1_000_000
 """Maximum time difference (nanoseconds) at which a true pose is used without interpolation.
@@ -79,12 +86,13 @@ class CameraScore:
 
     Attributes:
         frames: Number of frames of the video; None if unknown.
-        registered: Number of frames with an estimated pose.
+        registered: Number of frames with an estimated pose; 0 for a camera with rotations alone.
         coverage: Fraction of the video's frames with an estimated pose; None if `frames` is unknown.
         scored: Number of frames with an estimated pose and a true pose.
         ate_m: Absolute trajectory error: distance (metres) between estimated and true camera centre after
             alignment.
-        rotation_deg: Angle (degrees) between estimated and true orientation after alignment.
+        rotation_deg: Angle (degrees) between estimated and true orientation after alignment. Rotations alone,
+            without positions, have an alignment of their own.
         rpe_m: Translation part (metres) of the relative pose error over a second.
         rpe_deg: Rotation part (degrees) of the relative pose error over a second.
     """
@@ -162,12 +170,14 @@ class _MatchedPoses:
         estimate: (N,4,4) estimated poses.
         truth: (N,4,4) true poses.
         registered: Number of all estimated poses, including estimated poses without a true pose.
+        rotation_only: True if the estimates are rotations without positions: all positions are the same.
     """
 
     times_ns: IntArray
     estimate: FloatArray
     truth: FloatArray
     registered: int
+    rotation_only: bool
 
 
 def score_trajectories(
@@ -223,20 +233,24 @@ def score_trajectories(
 def _match_poses(estimate: TimedPoses, truth: TimedPoses) -> _MatchedPoses:
     """Associate the estimated poses of one camera with true poses."""
     poses, found = interpolate_truth(truth, estimate.times_ns)
+    centres = estimate.world_from_cam[:, :3, 3]
+    rotation_only = len(centres) > 1 and bool((centres == centres[0]).all())
     return _MatchedPoses(
         times_ns=estimate.times_ns[found],
         estimate=estimate.world_from_cam[found],
         truth=poses[found],
-        registered=len(found),
+        registered=0 if rotation_only else len(found),
+        rotation_only=rotation_only,
     )
 
 
 def _truth_from_estimate(pairs: Mapping[str, _MatchedPoses], align: Alignment) -> Similarity:
     """Return the alignment truth_from_estimate that fits the camera centres of all cameras best."""
-    if align == "none":
+    placed = [pair for pair in pairs.values() if not pair.rotation_only]
+    if align == "none" or not placed:
         return Similarity(1.0, np.eye(3), np.zeros(3))
-    estimate = np.concatenate([pair.estimate[:, :3, 3] for pair in pairs.values()])
-    truth = np.concatenate([pair.truth[:, :3, 3] for pair in pairs.values()])
+    estimate = np.concatenate([pair.estimate[:, :3, 3] for pair in placed])
+    truth = np.concatenate([pair.truth[:, :3, 3] for pair in placed])
     try:
         return align_points(estimate, truth, with_scale=align == "sim3")
     except ValueError as error:
@@ -252,8 +266,12 @@ def _pose_errors(pair: _MatchedPoses, alignment: Similarity) -> tuple[FloatArray
 
     Returns:
         (N,) errors of the camera centres, metres; (N,) errors of the orientations, degrees; (M,) relative
-        errors of the translation, metres; (M,) relative errors of the rotation, degrees.
+        errors of the translation, metres; (M,) relative errors of the rotation, degrees. The errors of
+        positions that are not known are empty.
     """
+    if pair.rotation_only:
+        sums = np.sum(pair.truth[:, :3, :3] @ np.swapaxes(pair.estimate[:, :3, :3], 1, 2), axis=0)
+        alignment = Similarity(1.0, nearest_rotation(sums), np.zeros(3))
     aligned = alignment.apply_to_poses(pair.estimate)
     centres = np.linalg.norm(aligned[:, :3, 3] - pair.truth[:, :3, 3], axis=1)
     difference = invert(pair.truth) @ aligned
@@ -263,7 +281,10 @@ def _pose_errors(pair: _MatchedPoses, alignment: Similarity) -> tuple[FloatArray
     expected = invert(pair.truth[first]) @ pair.truth[second]
     relative = invert(expected) @ estimated
     relative_angles = np.rad2deg(rotation_angle_rad(relative[:, :3, :3])) if len(first) else np.zeros(0)
-    return centres, angles, np.linalg.norm(relative[:, :3, 3], axis=1), relative_angles
+    relative_m = np.linalg.norm(relative[:, :3, 3], axis=1)
+    if pair.rotation_only:
+        centres, relative_m = np.zeros(0), np.zeros(0)
+    return centres, angles, relative_m, relative_angles
 
 
 def _pairs_at_interval(times_ns: IntArray) -> tuple[IntArray, IntArray]:

@@ -46,7 +46,7 @@ def collect_camera_scene(
     posed = [
         path
         for path in trajectories_in_target_frames(inputs)
-        if path.localised.any() and lens_of(inputs, path.camera) is not None
+        if (path.localised | path.rotation_only).any() and lens_of(inputs, path.camera) is not None
     ]
     paths = [path for path in posed if path.gauge == target]
     if not paths:
@@ -101,13 +101,14 @@ def _animated(inputs: ExportInputs, path: Trajectory, take: Take, count: int) ->
     pictures = np.flatnonzero([status is not FrameStatus.DAMAGED for status in path.status])
     shown = nearest_frames(common[pictures], frames, clock.nominal_fps)
     shown = np.where(shown >= 0, pictures[shown], -1)
-    valid = (shown >= 0) & path.localised[shown]
+    is_measured = path.localised | path.rotation_only
+    valid = (shown >= 0) & is_measured[shown]
     poses = _middle_row_poses(path, clock, inputs.row_fraction.get(path.camera))
     size = picture_size(lens, None if video is None else (video.width_px, video.height_px))
     return AnimatedCamera(
         name=path.camera,
         pinhole=pinhole_of(lens, *size),
-        scene_from_cam=poses[_held(shown, valid, path)],
+        scene_from_cam=poses[_held(shown, valid, is_measured)],
         valid=valid,
         video_frame=np.where(shown >= 0, path.frame_numbers[shown], -1),
         shift_s=np.where(shown >= 0, (common[shown] - frames) * 1e-9, np.nan),
@@ -118,11 +119,13 @@ def _animated(inputs: ExportInputs, path: Trajectory, take: Take, count: int) ->
 
 
 def _held(
-    shown: IntArray, valid: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], path: Trajectory
+    shown: IntArray,
+    valid: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
+    is_measured: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
 ) -> IntArray:
     """Return the index (T,) of the pose of each frame: that of the last valid frame, else the first one."""
     if not valid.any():  # the camera was localised, but not while the body moves
-        return np.full(len(shown), np.flatnonzero(path.localised)[0], dtype=np.int64)
+        return np.full(len(shown), np.flatnonzero(is_measured)[0], dtype=np.int64)
     latest = np.maximum.accumulate(np.where(valid, np.arange(len(shown)), -1))
     return np.asarray(shown[np.where(latest >= 0, latest, np.argmax(valid))])
 
@@ -130,15 +133,16 @@ def _held(
 def _middle_row_poses(path: Trajectory, clock: CameraClock, row_fraction: FloatArray | None) -> FloatArray:
     """Return the poses (N,4,4) at the exposure of the middle row, NaN for lost frames.
 
-    Poses of cameras whose rolling shutter the map did not correct are valid at the mean row of their
-    observations. They are moved along the path to the neighbouring frame, if it was localised.
+    A frame with a rotation alone is at the origin. Poses of cameras whose rolling shutter the map did not
+    correct are valid at the mean row of their observations. They are moved along the path to the neighbouring
+    frame, if it was localised.
 
     Args:
         path: The poses and their times.
         clock: The clock of the camera, with its readout time.
         row_fraction: (N,) mean row of the observations, as in `ExportInputs`; None for the middle row.
     """
-    poses = np.array(path.gauge_from_cam)
+    poses = path.poses_at_origin()
     if row_fraction is None or not clock.rolling_shutter_s:
         return poses
     later_s = np.nan_to_num(row_fraction - 0.5) * clock.rolling_shutter_s

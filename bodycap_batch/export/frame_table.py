@@ -22,8 +22,9 @@ def write_frame_table(path: Path, inputs: ExportInputs) -> Path:
     """Write one line for each frame of each camera, and return the path of the file.
 
     Times are in seconds. Errors are in pixels at the work size (the image size that all stages work at). The
-    column `status` is KEYFRAME, REGISTERED, INERTIAL or LOST. INERTIAL means that the pose was derived
-    from the inertial sensor. For a lost frame, the column `reason` holds the value of `FrameStatus`.
+    column `status` is KEYFRAME, REGISTERED, INERTIAL, ROTATION_ONLY or LOST. INERTIAL means that the pose was
+    derived from the inertial sensor, and ROTATION_ONLY that the frame has no position. For a lost frame, the
+    column `reason` holds the value of `FrameStatus`.
 
     The column `map` is the number of the map to which the pose refers, as in the names ``map_<n>.ply``; 0 is
     ``map.ply``. A lost frame with a pose in another map than that of the camera's path has the reason
@@ -93,4 +94,5 @@ def _sigmas(trajectory: Trajectory) -> tuple[FloatArray, FloatArray]:
 
 def _status_and_reason(status: FrameStatus) -> tuple[str, str]:
     """Return the values of the columns `status` and `reason`."""
-    return (status.value, "") if status.localised else (LOST, status.value)
+    is_measured = status.localised or status is FrameStatus.ROTATION_ONLY
+    return (status.value, "") if is_measured else (LOST, status.value)

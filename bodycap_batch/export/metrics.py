@@ -23,6 +23,7 @@ from bodycap_batch.export.target_frames import (
     trajectories_in_target_frames,
 )
 from bodycap_batch.model.geometry import invert, rotation_angle_rad, transform_points
+from bodycap_batch.model.path_uncertainty import path_uncertainty
 from bodycap_batch.model.relative_pose import RelativePose
 from bodycap_batch.model.rotation_path import PosePath
 from bodycap_batch.model.scene import FrameStatus, Map, Trajectory
@@ -176,6 +177,7 @@ def _camera_metrics(
         "frames": len(registered),
         "frames_registered": int(registered.sum()),
         "frames_in_other_maps": trajectory.status.count(FrameStatus.OTHER_MAP),
+        "frames_rotation_only": trajectory.status.count(FrameStatus.ROTATION_ONLY),
         "coverage": float(registered.mean()) if len(registered) else 0.0,
         "seconds": _duration_s(trajectory),
         "status": dict(sorted(Counter(status.value for status in trajectory.status).items())),
@@ -193,23 +195,6 @@ def _duration_s(trajectory: Trajectory) -> float:
     """Return the time that the frames of a camera cover, seconds: each frame lasts until the next one."""
     intervals_s = np.diff(trajectory.seconds)
     return float(intervals_s.sum() + np.median(intervals_s)) if len(intervals_s) else 0.0
-
-
-def path_uncertainty(trajectory: Trajectory) -> dict[str, Any]:
-    """Return the sigmas of a camera's poses and the extent of its path: root mean squares over its frames.
-
-    Lengths are in the unit of the trajectory's frame. All values are None without a pose.
-    """
-    posed = trajectory.registered
-    if not posed.any():
-        return {"sigma": None, "sigma_deg": None, "extent": None}
-    centres = trajectory.gauge_from_cam[posed, :3, 3]
-    variances = trajectory.covariance[posed].diagonal(axis1=1, axis2=2)
-    return {
-        "sigma": float(np.sqrt(variances[:, 3:].sum(axis=1).mean())),
-        "sigma_deg": float(np.degrees(np.sqrt(variances[:, :3].sum(axis=1).mean()))),
-        "extent": float(np.sqrt(((centres - centres.mean(axis=0)) ** 2).sum(axis=1).mean())),
-    }
 
 
 def _registration_metrics(trajectory: Trajectory) -> dict[str, Any]:
@@ -264,6 +249,7 @@ def _total_metrics(
         "frames": frames,
         "frames_registered": registered,
         "frames_in_other_maps": total("frames_in_other_maps"),
+        "frames_rotation_only": total("frames_rotation_only"),
         "coverage": registered / frames if frames else 0.0,
         "keyframes_selected": total("keyframes_selected"),
         "keyframes": total("keyframes"),

@@ -88,6 +88,9 @@ def write_maps(inputs: ExportInputs, left_out: list[str]) -> list[Path]:
 def write_trajectories(inputs: ExportInputs, left_out: list[str]) -> list[Path]:
     """Write one TUM file for each camera, with the camera's localised frames and own timestamps.
 
+    A frame with the status ROTATION_ONLY has its rotation, and the origin as its position, because the format
+    has no place for an unknown one. A comment says so.
+
     The files are in ``trajectories/``. If the poses of a camera are not in the main target frame, the file is
     in ``trajectories/unplaced/``. Poses of lost frames in the further map number n are in
     ``trajectories/map_<n>/``. A camera without localised frames has a file without poses, because an
@@ -109,20 +112,18 @@ def write_trajectories(inputs: ExportInputs, left_out: list[str]) -> list[Path]:
     for trajectory in inputs.other_paths:
         written.append(_write_path(top / f"map_{numbers[trajectory.gauge]}", trajectory))
     for trajectory in trajectories_in_target_frames(inputs):
-        localised = trajectory.localised
-        folder = top if trajectory.gauge == main_target or not localised.any() else top / "unplaced"
+        has_rows = (trajectory.localised | trajectory.rotation_only).any()
+        folder = top if trajectory.gauge == main_target or not has_rows else top / "unplaced"
         written.append(file := _write_path(folder, trajectory))
-        if not localised.any():
+        if not has_rows:
             left_out.append(f"trajectories/{file.name} has no poses: no frame of this camera was localised")
     return written
 
 
 def _write_path(folder: Path, trajectory: Trajectory) -> Path:
-    """Write the localised frames of a trajectory to a TUM file in a folder, and return its path."""
-    localised = trajectory.localised
-    poses = TimedPoses(
-        times_ns=trajectory.times_ns[localised], world_from_cam=trajectory.gauge_from_cam[localised]
-    )
+    """Write the frames of a trajectory with a rotation to a TUM file in a folder, and return its path."""
+    rows = trajectory.localised | trajectory.rotation_only
+    poses = TimedPoses(times_ns=trajectory.times_ns[rows], world_from_cam=trajectory.poses_at_origin()[rows])
     file = folder / f"{trajectory.camera}.tum"
     write_tum(file, poses, _header_comments(trajectory))
     return file
@@ -132,7 +133,10 @@ def _header_comments(trajectory: Trajectory) -> list[str]:
     """Return the comments at the top of a TUM file: camera, frame of reference and clock."""
     source = "world_from_camera" if trajectory.gauge == WORLD else "map_from_camera"
     poses = f"{source}: {describe_target(trajectory.gauge)}"
-    return [f"camera {trajectory.camera}", poses, "timestamps: the camera's own clock, seconds"]
+    out = [f"camera {trajectory.camera}", poses, "timestamps: the camera's own clock, seconds"]
+    if count := int(trajectory.rotation_only.sum()):
+        out.append(f"{count} frames have a rotation only (ROTATION_ONLY in frames.csv): 0 0 0 is no position")
+    return out
 
 
 def write_colmap(inputs: ExportInputs) -> list[Path]:

@@ -78,6 +78,11 @@ class FrameTable:
         return np.array([status.localised for status in self.status], dtype=bool)
 
     @property
+    def rotation_only(self) -> BoolArray:
+        """Mask (N,) of the frames with a rotation and no position."""
+        return np.array([status is FrameStatus.ROTATION_ONLY for status in self.status], dtype=bool)
+
+    @property
     def times_s(self) -> FloatArray:
         """Time (N,) of each frame on the camera's own clock, seconds."""
         return np.asarray(self.times_ns * 1e-9)

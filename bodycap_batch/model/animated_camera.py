@@ -34,7 +34,8 @@ class AnimatedCamera:
         pinhole: The undistorted camera, with square pixels and the principal point in the centre.
         scene_from_cam: (T,4,4) poses. A frame that is not valid has the pose of the last valid frame before
             it, or of the first valid frame.
-        valid: (T,) True if the picture of the frame was localised.
+        valid: (T,) True if the picture of the frame was localised, or if its rotation alone is known. Then
+            its position is zero, and has no sigma.
         video_frame: (T,) number of the frame of the video whose picture and pose the frame has; −1 before the
             start and after the end of the video.
         shift_s: (T,) instant of the middle row of this picture − time of the frame, seconds; NaN without a
@@ -93,6 +94,7 @@ class AnimatedCamera:
             "vertical_fov_deg": round(float(np.degrees(self.vertical_fov_rad)), 6),
             "clock_is_known": self.clock_is_known,
             "valid_frames": true_spans(self.valid),
+            "rotation_only_frames": true_spans(self.valid & ~np.isfinite(self.sigma_position)),
             "video_frame": self.video_frame.tolist(),
             "shift_s": json_numbers(self.shift_s, 6),
             "sigma_deg": json_numbers(np.degrees(self.sigma_rad), 4),

@@ -36,6 +36,7 @@ class FrameStatus(StrEnum):
     REGISTERED: The pose was estimated from the frame's own observations.
     INERTIAL: The frame itself gave no pose. The pose follows from the inertial sensor of the camera, between
         localised frames before and after.
+    ROTATION_ONLY: Not localised. The frame has a rotation, but the camera hardly moves and shows no position.
     BLUR: Lost; too few tracks reach the frame, and the image is blurred.
     FEW_TRACKS: Lost; too few tracks reach the frame, although the image is sharp.
     FEW_INLIERS: Lost; too few observations agree with any pose.
@@ -53,6 +54,7 @@ class FrameStatus(StrEnum):
     KEYFRAME = "KEYFRAME"
     REGISTERED = "REGISTERED"
     INERTIAL = "INERTIAL"
+    ROTATION_ONLY = "ROTATION_ONLY"
     BLUR = "BLUR"
     FEW_TRACKS = "FEW_TRACKS"
     FEW_INLIERS = "FEW_INLIERS"
@@ -273,10 +275,12 @@ class Trajectory:
             (metres, Z up).
         frame_numbers: (N,) number of each frame in the video, counted from 0.
         times_ns: (N,) timestamp of each frame on the clock of the camera, nanoseconds.
-        gauge_from_cam: (N,4,4) camera poses in the gauge; NaN for lost frames.
+        gauge_from_cam: (N,4,4) camera poses in the gauge; NaN for lost frames. A frame with the status
+            ROTATION_ONLY has a rotation, and NaN as its position.
         covariance: (N,6,6) covariance of each pose in the axes of the camera: rotation (rad) first, then
             translation (unit of the gauge). As in GTSAM's Pose3, the perturbation multiplies the pose from
-            the right. NaN for lost frames.
+            the right. NaN for lost frames. With the status ROTATION_ONLY, the part of the
+            rotation is known.
         status: (N,) status of each frame.
         inliers: (N,) number of PnP inliers of each frame.
         error_px: (N,) mean reprojection error of the inliers, pixels; NaN for a frame without inliers.
@@ -304,6 +308,8 @@ class Trajectory:
         posed = np.isfinite(self.gauge_from_cam).all(axis=(1, 2))
         if (posed != self.localised).any():
             raise ValueError("status and poses disagree on which frames are localised")
+        if not np.isfinite(self.gauge_from_cam[self.rotation_only, :3, :3]).all():
+            raise ValueError("status and poses disagree on which frames have a rotation")
 
     def without(self, frames: BoolArray, status: FrameStatus) -> Trajectory:
         """Return the trajectory without the poses of some frames.
@@ -324,6 +330,17 @@ class Trajectory:
     def localised(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
         """Mask (N,) that is True for the frames with a measured pose."""
         return np.array([status.localised for status in self.status], dtype=bool)
+
+    @property
+    def rotation_only(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+        """Mask (N,) that is True for the frames with a measured rotation and no position."""
+        return np.array([status is FrameStatus.ROTATION_ONLY for status in self.status], dtype=bool)
+
+    def poses_at_origin(self) -> FloatArray:
+        """Return the poses (N,4,4) for files that need a position: zeros where only the rotation is known."""
+        poses = self.gauge_from_cam.copy()
+        poses[self.rotation_only, :3, 3] = 0.0
+        return poses
 
     @property
     def registered(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:

@@ -55,6 +55,7 @@ from bodycap_batch.tasks.preview import PREVIEW
 from bodycap_batch.tasks.recover import RECOVER, RecoverTask
 from bodycap_batch.tasks.registration import REGISTRATION, RegistrationTask
 from bodycap_batch.tasks.report import REPORT
+from bodycap_batch.tasks.rotations import ROTATIONS, RotationsTask, without_positions
 from bodycap_batch.tasks.sound import SOUND, SoundTask, known_from_sound
 from bodycap_batch.tasks.stage import Stage, read_summary
 from bodycap_batch.tasks.undistort import UNDISTORT, UndistortTask
@@ -86,6 +87,7 @@ class Flow:
         self._threads = settings.threads
         self._cameras: dict[str, str] = {}
         self._map_round = 0
+        self._map_failure: EstimationError | None = None
         self._with_telemetry = frozenset[str]()
         self._with_gyro = frozenset[str]()
         self._stabilised = frozenset[str]()
@@ -156,8 +158,18 @@ class Flow:
         return selected
 
     def map(self, keyframes: ByCamera) -> Artefact:
-        """Build the map of all keyframes and return its artefact."""
+        """Build the map of all keyframes and return its artefact.
+
+        Without a body, the map may be empty: `measure_rotations` then has the last word.
+
+        Raises:
+            EstimationError: There is no map.
+        """
         artefact = self._build(keyframes)
+        if (failure := read_summary(artefact.path)["failure"]) is not None:
+            self._map_failure = EstimationError(failure["message"], hint=failure["hint"])
+            if self._settings.until == "map":
+                raise self._map_failure
         if self._sound is not None:
             self._sound.result()  # The sound is compared in much less time, so this does not wait.
         self.runner.report_notes(artefact, "map")
@@ -170,6 +182,7 @@ class Flow:
             capture=self._footage(),
             keyframes=refs_by_camera(keyframes),
             refined=optional_ref(refined),
+            may_be_empty=self._may_be_rotations and refined is None,
         )
         body: list[Stage[Any]] = [MERGE, FILL] if has_body(self._job) else []
         later: list[Stage[Any]] = [REGISTRATION, CLOCKS, LINKS, *body, EXPORT, REPORT]
@@ -404,7 +417,8 @@ class Flow:
         """
         summaries = [read_summary(artefact.path) for artefact in registrations.values()]
         lost = [summary["frames"] - summary["localised"] for summary in summaries]
-        if sum(lost) < LEAST_MAPPED or not is_on(Mechanism.FURTHER_MAPS):
+        is_empty = self._map_failure is not None
+        if is_empty or sum(lost) < LEAST_MAPPED or not is_on(Mechanism.FURTHER_MAPS):
             return scene_map, registrations
         task = FurtherMapsTask(
             options=self._job.map,
@@ -449,6 +463,48 @@ class Flow:
             )
             for name, registration in registrations.items()
         )
+
+    def measure_rotations(
+        self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera, links: ByCamera
+    ) -> tuple[ByCamera, ByCamera]:
+        """Measure the rotations of the cameras whose positions say nothing, and withdraw these positions.
+
+        A job with a body keeps the positions: the body needs them, and its scale can make them certain.
+
+        Returns:
+            The registrations, and what the tracks show about their paths.
+
+        Raises:
+            EstimationError: There is no map, and the cameras move.
+        """
+        if not self._may_be_rotations:
+            return registrations, links
+        names = without_positions({name: read_summary(each.path) for name, each in links.items()})
+        measured = self.runner.run_all(
+            make_task(
+                ROTATIONS,
+                RotationsTask(
+                    capture=self._footage([camera]),
+                    keyframes=refs_by_camera({camera.name: keyframes[camera.name]}),
+                    map=artefact_ref(scene_map),
+                    registration=artefact_ref(registrations[camera.name]),
+                ),
+                camera=camera.name,
+                threads=threads,
+            )
+            for camera, threads in zip(self._capture.cameras, self.runner.threads_per_camera(), strict=True)
+            if camera.name in names
+        )
+        turned = {name: each for name, each in measured.items() if read_summary(each.path)["rotations"]}
+        if self._map_failure is not None and not turned:
+            raise self._map_failure
+        again = self.compare_with_tracks(scene_map, turned, keyframes)
+        return {**registrations, **turned}, {**links, **again}
+
+    @property
+    def _may_be_rotations(self) -> bool:
+        """True if the job can have rotations without positions as its result."""
+        return not has_body(self._job) and is_on(Mechanism.MERE_TURN)
 
     def merge(
         self, scene_map: Artefact, registrations: ByCamera, clocks: Artefact, keyframes: ByCamera

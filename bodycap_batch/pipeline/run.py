@@ -138,7 +138,14 @@ def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
     results.clocks = flow.clocks(results.map, results.registrations)
     found = flow.use_sensors(results.registrations)
     results.map, results.registrations = flow.map_lost_parts(results.map, found, keyframes)
-    results.links = flow.compare_with_tracks(results.map, results.registrations, keyframes)
+    links = flow.compare_with_tracks(results.map, results.registrations, keyframes)
+    try:
+        results.registrations, results.links = flow.measure_rotations(
+            results.map, results.registrations, keyframes, links
+        )
+    except EstimationError:  # there is no map
+        results.stage, results.map, results.clocks, results.registrations = "map", None, None, {}
+        raise
     yield "registration"
     results.stage = "merge"
     if results.failure is None:

@@ -120,7 +120,7 @@ def draw_tile(
     box = tile.video_box
     if video_image is not None:
         painted = _with_overlay(video_image, tile.view, frame, points, bone_motion)
-        if not status.localised:
+        if not status.localised and status is not FrameStatus.ROTATION_ONLY:
             painted = (painted * _LOST_BRIGHTNESS).astype(np.uint8)
         image[box.y : box.y + box.height, box.x : box.x + box.width] = painted
     if video_image is None:
@@ -163,6 +163,8 @@ def _with_overlay(
 
 def describe_status(status: FrameStatus, points: ObservedPoints | None) -> tuple[str, Colour]:
     """Return the text about a frame's pose, and the colour of this text."""
+    if status is FrameStatus.ROTATION_ONLY:
+        return "rotation only, no position", AMBER
     if not status.localised or points is None:
         return f"lost: {_LOSS_REASONS.get(status, status.value)}", RED
     if status is FrameStatus.INERTIAL:

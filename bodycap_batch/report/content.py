@@ -218,6 +218,7 @@ def _missing(
         "end": _clock_text(span[1]),
         "more": len(losses) - len(longest),
         "other": any(each.cause is LossCause.OTHER_MAP for each in losses),
+        "turn": any(each.cause is LossCause.ROTATION_ONLY for each in losses),
         "intervals": [
             {
                 "time": f"{_clock_text(each.loss.start_s)} to {_clock_text(each.loss.end_s)}",

@@ -27,6 +27,7 @@ class CameraCoverage:
         frames: Number of frames of the video.
         delivered: Number of frames with a pose from their own picture.
         other_maps: Number of further frames with a pose in another map than that of the camera's path.
+        rotation_only: Number of further frames with a rotation and no position.
         seconds: Duration of the video; None if the metrics do not state it.
         reason: Why the camera, or a part of its video, is left out; "" if it is not.
         lost: The lost spans; empty if they were not looked at.
@@ -35,6 +36,7 @@ class CameraCoverage:
     frames: int
     delivered: int
     other_maps: int
+    rotation_only: int
     seconds: float | None
     reason: str
     lost: tuple[LostSpan, ...]
@@ -49,6 +51,7 @@ class CameraCoverage:
         return {
             **_amounts(self.frames, self.delivered, self.seconds),
             "frames_in_other_maps": self.other_maps,
+            "frames_rotation_only": self.rotation_only,
             "reason": self.reason,
             "lost": [span.to_dict() for span in self.lost],
         }
@@ -109,6 +112,11 @@ class Coverage:
         return sum(camera.other_maps for camera in self.cameras.values())
 
     @property
+    def rotation_only(self) -> int:
+        """Number of further frames of all cameras with a rotation and no position."""
+        return sum(camera.rotation_only for camera in self.cameras.values())
+
+    @property
     def share(self) -> float:
         """Share of the frames of all cameras that are delivered."""
         delivered = sum(camera.delivered for camera in self.cameras.values())
@@ -123,6 +131,8 @@ class Coverage:
     def text(self) -> str:
         """The coverage in words: the share of the frames, and the camera with the smallest share."""
         every = f"{format_percent(self.share, 1)} of the frames"
+        if self.rotation_only:
+            every += f", and the rotation alone of {format_percent(self.rotation_only / self.frames, 1)}"
         if self.share == 1.0 or len(self.cameras) < 2:
             return every
         return f"{every}; {self.worst} {format_percent(self.cameras[self.worst].share, 1)}"
@@ -135,6 +145,7 @@ class Coverage:
         return {
             **_amounts(self.frames, delivered, seconds),
             "frames_in_other_maps": self.other_maps,
+            "frames_rotation_only": self.rotation_only,
             "cameras": {name: camera.to_dict() for name, camera in self.cameras.items()},
             "body": None if self.body is None else self.body.to_dict(),
             "advice": [each.to_dict() for each in self.advice],
@@ -165,6 +176,7 @@ def measure_coverage(metrics: Metrics, lost: Sequence[LostSpan] = ()) -> Coverag
             frames=int(camera["frames"]),
             delivered=int(camera["frames_registered"]) if name in inside else 0,
             other_maps=int(camera.get("frames_in_other_maps", 0)),
+            rotation_only=int(camera.get("frames_rotation_only", 0)),
             seconds=camera.get("seconds"),
             reason=reasons.get(name, ""),
             lost=tuple(span for span in lost if span.camera == name),
@@ -201,7 +213,9 @@ def _reasons(metrics: Metrics) -> dict[str, str]:
     }
     reasons |= dict.fromkeys(cameras_in_own_maps(metrics), "its map has no place in common with the main map")
     reasons |= {
-        name: "no frame has a pose"
+        name: "only its rotation is known, because it hardly moves"
+        if each.get("frames_rotation_only")
+        else "no frame has a pose"
         for name, each in metrics["cameras"].items()
         if not each["frames_registered"]
     }

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from bodycap_batch.config.path_bounds import MAX_CONTRADICTED, MAX_UNCERTAINTY
 from bodycap_batch.core.percent import format_percent
 from bodycap_batch.report import readings
 from bodycap_batch.report.grades import Advice, Bounds, Criterion, Grade
@@ -75,7 +76,7 @@ CAMERA_RULES = (
     Rule(
         name="Uncertainty of the paths",
         read=readings.read_path_uncertainty,
-        bounds=Bounds(good=0.2, fair=0.25, more_is_better=False),
+        bounds=Bounds(good=0.2, fair=MAX_UNCERTAINTY),
         finding="the positions of {camera} are uncertain by {percent} of the extent of the longest path",
         rationale="Compared are root mean squares, the position's standard deviation and its distance from "
         "the mean position. Up to a fifth, the shape of the path is clear. Above a quarter, it may be "
@@ -85,9 +86,17 @@ CAMERA_RULES = (
         priority=1.6,
     ),
     Rule(
+        name="Rotation alone",
+        read=readings.read_rotation_only,
+        grade=Grade.FAIR,
+        finding="{cameras}: only the rotation is known, to ± {sigma:.2f}° per axis; no position is delivered",
+        rationale="A camera that moves by a hundredth of the distance to the room shows how it turns, and "
+        "not where it is. A path that a map gave would be noise, or that of a thing which the hands move.",
+    ),
+    Rule(
         name="Links of the video",
         read=readings.read_links,
-        bounds=Bounds(good=0.02, fair=0.05),
+        bounds=Bounds(good=0.02, fair=MAX_CONTRADICTED),
         finding="{camera}: the video contradicts {percent} of the compared frames{where}",
         rationale="Points are followed through the video without any map. They show how the camera turned "
         "and moved from frame to frame, and where a path folds, leaps or changes its scale.",
@@ -335,7 +344,13 @@ def judge_criteria(metrics: Metrics) -> Iterator[Criterion]:
     Args:
         metrics: The content of ``metrics.json``.
     """
-    yield from judge_rules("cameras", CAMERA_RULES, metrics)
+    rules: Sequence[Rule] = CAMERA_RULES
+    if readings.read_rotation_only(metrics) is not None and not readings.main_cameras(metrics):
+        # No path depends on the map, so what it is like says nothing about what is delivered.
+        rules = tuple(
+            rule for rule in rules if rule.read in (readings.read_rotation_only, readings.read_frozen)
+        )
+    yield from judge_rules("cameras", rules, metrics)
     if "merge" in metrics:
         yield from judge_rules("body", BODY_RULES, metrics)
 

@@ -74,6 +74,7 @@ _CAUSES_OF_REASONS = {
     FrameStatus.CONTRADICTED: LossCause.CONTRADICTED,
     FrameStatus.NO_MAP: LossCause.NO_MAP,
     FrameStatus.OTHER_MAP: LossCause.OTHER_MAP,
+    FrameStatus.ROTATION_ONLY: LossCause.ROTATION_ONLY,
     FrameStatus.DAMAGED: LossCause.DAMAGED,
     FrameStatus.FROZEN: LossCause.FROZEN,
 }

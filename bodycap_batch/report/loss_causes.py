@@ -41,6 +41,7 @@ class LossCause(StrEnum):
     CONTRADICTED = "part that contradicts the map"
     NO_MAP = "no map for this camera"
     OTHER_MAP = "part in another map"
+    ROTATION_ONLY = "camera that hardly moves"
     DAMAGED = "damaged video"
     FROZEN = "frozen recording"
 
@@ -118,6 +119,11 @@ CAUSES = {
         "Turn more slowly between the parts of the video, and let the camera see the same things before and "
         "after.",
     ),
+    LossCause.ROTATION_ONLY: (
+        "only its rotation is known",
+        "Move the camera by at least a twentieth of the distance to the room, or walk some steps: a camera "
+        "that only turns shows no position.",
+    ),
     LossCause.DAMAGED: (
         "the decoder reports damaged data, or gives no picture for the frame",
         "Copy the video again from the camera's card. If it is damaged there, too, use another card.",
@@ -151,9 +157,10 @@ def advice_about_losses(lost: Sequence[LostSpan], frames: int) -> Iterator[Advic
             if (own := [span for span in spans if span.camera == camera])
         )
         rule, action = CAUSES[cause]
+        are = "have a rotation only" if cause is LossCause.ROTATION_ONLY else "were lost"
         yield Advice(
             action=action,
-            reason=f"{count} frames were lost ({where}); likely cause: {cause.value} ({rule})",
+            reason=f"{count} frames {are} ({where}); likely cause: {cause.value} ({rule})",
             priority=1.0 + count / frames,
         )
 

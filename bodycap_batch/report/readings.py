@@ -190,6 +190,18 @@ def read_path_uncertainty(metrics: Metrics) -> Reading | None:
     return Reading(value=share, words={"camera": name, "percent": f"{100 * share:.2g} %"})
 
 
+def read_rotation_only(metrics: Metrics) -> Reading | None:
+    """Read which cameras have rotations without positions, and the largest sigma of a rotation per axis."""
+    found = {
+        name: float(camera["sigma_deg"]) / 3**0.5
+        for name, camera in metrics["cameras"].items()
+        if camera.get("frames_rotation_only")
+    }
+    if not found:
+        return None
+    return Reading(words={"cameras": ", ".join(sorted(found)), "sigma": max(found.values())})
+
+
 def read_links(metrics: Metrics) -> Reading | None:
     """Read the largest share of a camera's frames, in all maps, that the tracks of its video contradict."""
     shares = {

@@ -11,7 +11,12 @@ from bodycap_batch.report.coverage import Coverage, measure_coverage
 from bodycap_batch.report.criteria import judge_criteria
 from bodycap_batch.report.grades import Criterion, Grade
 from bodycap_batch.report.loss_causes import LostSpan
-from bodycap_batch.report.readings import cameras_in_own_maps, main_cameras, unknown_clocks
+from bodycap_batch.report.readings import (
+    cameras_in_own_maps,
+    main_cameras,
+    read_rotation_only,
+    unknown_clocks,
+)
 
 VERDICT_FILE = "verdict.json"
 VERDICT_SCHEMA = 1
@@ -81,7 +86,7 @@ def judge(
     criteria = () if metrics is None else tuple(judge_criteria(metrics))
     cameras, body = Grade.NONE, None
     if metrics is not None:
-        if main_cameras(metrics):
+        if main_cameras(metrics) or read_rotation_only(metrics) is not None:
             cameras = _worst_grade(criteria, "cameras")
         if "merge" in metrics:
             body = _worst_grade(criteria, "body")

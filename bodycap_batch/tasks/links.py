@@ -28,19 +28,28 @@ class LinksTask:
 
 
 def run_links(task: LinksTask, context: StageContext, files: Path) -> None:
-    """Store how many frames of each path of the camera the tracks confirm and contradict."""
+    """Store how many frames of each path the tracks confirm and contradict, and how certain the path is."""
     from bodycap_batch.evaluate.track_check import TrackedVideo, check_with_tracks, count_frames
     from bodycap_batch.formats.dataclass_files import read_dataclass
+    from bodycap_batch.model.path_uncertainty import path_uncertainty
     from bodycap_batch.model.point_tracks import PointTracks
     from bodycap_batch.model.scene import OtherPaths
 
     registration = task.registration.path
-    paths = [load_registration(registration).trajectory]
+    path = load_registration(registration).trajectory
+    paths = [path]
     if (registration / f"{OTHER_PATHS}.json").exists():
         paths += read_dataclass(OtherPaths, registration, OTHER_PATHS).trajectories
+    certainty = path_uncertainty(path)
+    found = {
+        "frame": path.gauge,
+        "posed": any(bool(each.localised.any()) for each in paths),
+        "sigma": certainty["sigma"],
+        "extent": certainty["extent"],
+    }
     keyframes = task.keyframes.path
     if not (keyframes / f"{TRACKS}.json").exists():
-        write_summary(files, links=[])
+        write_summary(files, links=[], **found)
         return
     tracks = read_dataclass(PointTracks, keyframes, TRACKS)
     chain, maps = load_keyframes(keyframes).rotation_chain, load_map(task.map.path).maps
@@ -60,9 +69,9 @@ def run_links(task: LinksTask, context: StageContext, files: Path) -> None:
             readout_s=scene.readout_s.get(path.camera, 0.0),
             rotation_chain=chain,
         )
-        found = check_with_tracks(video, path.gauge_from_cam, show)
-        links.append({"frame": path.gauge, **count_frames(found)})
-    write_summary(files, links=links)
+        compared = check_with_tracks(video, path.gauge_from_cam, show)
+        links.append({"frame": path.gauge, **count_frames(compared)})
+    write_summary(files, links=links, **found)
 
 
 LINKS = Stage(

@@ -30,12 +30,14 @@ class MapTask:
         refined: An earlier map of the same pictures, in which rolling shutters were found. The new map is
             built from its features, with keypoints that are corrected for the shutters. None in the first
             round.
+        may_be_empty: Store an empty map if there is none, because rotations alone are a result, too.
     """
 
     options: MapOptions
     capture: CaptureRef
     keyframes: Mapping[str, ArtefactRef]
     refined: ArtefactRef | None = None
+    may_be_empty: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,14 +78,21 @@ class RefineTask:
 
 def run_map(task: MapTask, context: StageContext, files: Path) -> None:
     """Build the map and store it."""
-    from bodycap_batch.mapping import build_map, earlier_results
+    from bodycap_batch.core.errors import NO_MOTION_HINT, EstimationError
+    from bodycap_batch.mapping import build_map, earlier_results, empty_map
 
     selections = [load_keyframes(artefact.path) for artefact in task.keyframes.values()]
     capture = load_capture(task.capture, task.keyframes, threads=context.threads)
     refined = None if task.refined is None else load_map(task.refined.path)
     earlier = earlier_results(capture, refined)
-    result = build_map(capture, selections, task.options, context, earlier=earlier)
-    save_map(result, files)
+    try:
+        result = build_map(capture, selections, task.options, context, earlier=earlier)
+    except EstimationError as error:
+        if not task.may_be_empty or error.hint == NO_MOTION_HINT:
+            raise
+        save_map(empty_map(capture, selections, context, error), files)
+    else:
+        save_map(result, files)
 
 
 def run_extend(task: ExtendTask, context: StageContext, files: Path) -> None:
@@ -161,6 +170,7 @@ def save_map(
         corrected=list(corrected),
         corrected_before=list(corrected_before),
         distorted=list(distorted),
+        failure=result.log.get("failure"),
         further=len(result.log.get("further_maps", ())),
         notes=[
             *flip_notes(diagnostics),

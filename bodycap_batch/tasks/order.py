@@ -12,11 +12,22 @@ STAGE_ORDER: tuple[StageName, ...] = get_args(StageName)
 BESIDE_KEYFRAMES = frozenset({"sound"})
 """Further stages that run at the same time as the keyframes."""
 _DURING_REGISTRATION = frozenset(
-    {"extend", "refine", "recover", "clocks", "places", "inertial", "further_maps", "further_poses", "links"}
+    {
+        "extend",
+        "refine",
+        "recover",
+        "clocks",
+        "places",
+        "inertial",
+        "further_maps",
+        "further_poses",
+        "links",
+        "rotations",
+    }
 )
 """Further stages that may run up to the merge. They extend and refine the map, recover lost frames, determine
 the clocks, find the places of cameras from the motion, use the inertial sensors, map what is still
-lost, and compare the paths with the tracks."""
+lost, compare the paths with the tracks, and measure rotations without positions."""
 
 
 def stages_from(stage: StageName) -> frozenset[str]:

@@ -109,6 +109,7 @@ def save_registration(
         files,
         frames=len(found.trajectory.status),
         localised=int(found.trajectory.localised.sum()),
+        rotations=int(found.trajectory.rotation_only.sum()),
         contradicted=found.trajectory.status.count(FrameStatus.CONTRADICTED),
         wanted=[int(frame) for frame in found.wanted_keyframes],
         rolling=rolling,

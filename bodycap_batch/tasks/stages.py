@@ -20,6 +20,7 @@ from bodycap_batch.tasks.preview import PREVIEW
 from bodycap_batch.tasks.recover import RECOVER
 from bodycap_batch.tasks.registration import REGISTRATION
 from bodycap_batch.tasks.report import REPORT
+from bodycap_batch.tasks.rotations import ROTATIONS
 from bodycap_batch.tasks.sound import SOUND
 from bodycap_batch.tasks.stage import Stage
 from bodycap_batch.tasks.synth import SYNTH
@@ -43,6 +44,7 @@ STAGES: Mapping[str, Stage[Any]] = {
         FURTHER_MAPS,
         FURTHER_POSES,
         LINKS,
+        ROTATIONS,
         MERGE,
         FILL,
         EXPORT,

@@ -38,9 +38,9 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.evaluate.picture_check import poses_of_frames, read_delivered
 from bodycap_batch.evaluate.track_check import TrackedVideo, check_with_tracks, count_frames
 from bodycap_batch.evaluate.trajectories import interpolate_truth
-from bodycap_batch.export.metrics import path_uncertainty
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.job_places import capture_of_results, find_job
+from bodycap_batch.model.path_uncertainty import path_uncertainty
 from bodycap_batch.model.point_tracks import STORED_STEP
 from bodycap_batch.report.criteria import CAMERA_RULES
 from bodycap_batch.report.grades import Grade

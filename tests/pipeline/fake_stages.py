@@ -21,6 +21,7 @@ ORDERS = "BODYCAP_FAKE_ORDERS"
 "wanted" | "localised" | "contradicted": [a value per round], "lost": {camera: frames},
  "unused": {camera: reason}, "rolling": true, "late": number of maps,
  "unknown_clocks": [cameras], "corrected" | "corrected_before" | "distorted": [cameras] in refined maps,
+ "no_map": {"message", "hint"}, "unposed": true, "moves": true,
  "fail_rebuilt": true, "telemetry": [cameras], "stabilised": [cameras],
  "real": [stages that are no stand-ins]}.
  "fail" may be a list of stages."""
@@ -99,7 +100,8 @@ def videos(arguments: Json) -> list[str]:
 
 def summary(options: Json, arguments: Json, files: Path) -> None:
     unknown = orders().get("unknown_clocks", [])
-    (files / "summary.json").write_text(json.dumps({"notes": ["a note"], "frames": 20, "unknown": unknown}))
+    values = {"notes": ["a note"], "frames": 20, "unknown": unknown, "failure": orders().get("no_map")}
+    (files / "summary.json").write_text(json.dumps(values))
 
 
 def with_sensor(options: Json, arguments: Json, files: Path) -> None:
@@ -190,6 +192,19 @@ def further_mapped(options: Json, arguments: Json, files: Path) -> None:
     (files / "summary.json").write_text(json.dumps({"further": orders().get("further", 0)}))
 
 
+def linked(options: Json, arguments: Json, files: Path) -> None:
+    posed = not orders().get("unposed", False)
+    values = {"links": [], "frame": "map", "posed": posed, "sigma": None, "extent": None}
+    (files / "summary.json").write_text(json.dumps(values))
+
+
+def turned(options: Json, arguments: Json, files: Path) -> None:
+    """The rotations of a camera; none if it moves."""
+    before = json.loads((Path(arguments["registration"]["path"]) / "summary.json").read_text())
+    rotations = 0 if orders().get("moves", False) else before["frames"]
+    (files / "summary.json").write_text(json.dumps({**before, "rotations": rotations}))
+
+
 def merged(options: Json, arguments: Json, files: Path) -> None:
     (files / "summary.json").write_text(
         json.dumps({"notes": ["a note"], "unused_cameras": orders().get("unused", {})})
@@ -236,6 +251,8 @@ EXTRA = {
     "recover": recovered,
     "sound": heard,
     "further_maps": further_mapped,
+    "links": linked,
+    "rotations": turned,
     "merge": merged,
     "export": exported,
     "places": placed,
@@ -259,6 +276,7 @@ NAMES = (
     "further_maps",
     "further_poses",
     "links",
+    "rotations",
     "merge",
     "fill",
     "export",

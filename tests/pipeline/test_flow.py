@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from bodycap_batch.config.models import Job
+from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.pipeline import Settings, run_job
 from bodycap_batch.pipeline.flow import Flow, _read_ahead
 from bodycap_batch.runner import Children, Task, TaskEnvironment
@@ -17,7 +20,7 @@ from bodycap_batch.runner.child_pool import do_nothing
 from bodycap_batch.store.artefacts import Store
 from bodycap_batch.store.code_version import Program
 from bodycap_batch.tasks.stages import STAGES
-from tests.pipeline.test_run import CHILD, Bench, bench
+from tests.pipeline.test_run import CAMERAS, CHILD, Bench, bench
 
 __all__ = ["bench"]
 
@@ -110,3 +113,67 @@ def test_a_board_is_searched_for_in_the_stored_frames_of_keyframes(bench: Bench,
     run_job(bench.job(merge={"marker_board": board}), out_dir=bench.out, settings=settings)
     footage, mapped = children.arguments["merge"]["footage"], children.arguments["map"]
     assert footage == (None if board is None else {name: mapped[name] for name in ("capture", "keyframes")})
+
+
+def stages_of(bench: Bench, **changes: Any) -> Counter[str]:
+    """Run a job, and return how often each stage ran or was reused."""
+    return Counter(stage.stage for stage in bench.run(**changes).stages)
+
+
+def test_cameras_without_positions_have_their_rotations_measured(bench: Bench) -> None:
+    bench.order(unposed=True)
+    ran = stages_of(bench, skeleton="none")
+    assert ran["rotations"] == len(CAMERAS)
+    assert ran["links"] == 2 * len(CAMERAS), "the paths of rotations are compared again"
+
+
+def test_cameras_with_positions_keep_them(bench: Bench) -> None:
+    assert "rotations" not in stages_of(bench, skeleton="none")
+
+
+def test_a_camera_that_moves_keeps_its_path(bench: Bench) -> None:
+    bench.order(unposed=True, moves=True)
+    ran = stages_of(bench, skeleton="none")
+    assert (ran["rotations"], ran["links"]) == (len(CAMERAS), len(CAMERAS))
+
+
+def test_a_body_keeps_the_positions_of_its_cameras(bench: Bench) -> None:
+    bench.order(unposed=True)
+    assert "rotations" not in stages_of(bench)
+
+
+NO_MAP = {"message": "no map works out", "hint": "move the cameras"}
+
+
+def test_without_a_map_the_rotations_are_the_result(bench: Bench) -> None:
+    bench.order(no_map=NO_MAP, unposed=True, lost={"torso": 90})
+    ran = stages_of(bench, skeleton="none")
+    assert ran["rotations"] == len(CAMERAS)
+    assert "further_maps" not in ran, "there is nothing to which further maps could be compared"
+    assert (bench.out / "report.html").exists()
+
+
+def test_without_a_map_and_rotations_the_job_ends_with_the_reason_of_the_map(bench: Bench) -> None:
+    bench.order(no_map=NO_MAP, unposed=True, moves=True)
+    with pytest.raises(EstimationError, match="no map works out") as caught:
+        bench.run(skeleton="none")
+    assert "move the cameras" in str(caught.value.hint)
+    page = (bench.out / "partial" / "report.html").read_text(encoding="utf-8")
+    assert page.startswith("map: no map works out; keyframes")
+    assert "registrations" not in page
+
+
+def test_only_a_job_without_a_body_may_have_an_empty_map(bench: Bench) -> None:
+    for skeleton, may_be_empty in (("none", True), ("upper_body", False)):
+        children = Watched()
+        settings = replace(bench.settings(), executor=children)
+        run_job(bench.job(skeleton=skeleton), out_dir=bench.out, settings=settings)
+        assert children.arguments["map"]["may_be_empty"] is may_be_empty
+
+
+def test_a_run_until_the_map_names_its_failure(bench: Bench) -> None:
+    bench.order(no_map=NO_MAP)
+    with pytest.raises(EstimationError, match="no map works out"):
+        run_job(
+            bench.job(skeleton="none"), out_dir=bench.out, settings=replace(bench.settings(), until="map")
+        )

@@ -195,7 +195,11 @@ def check_consistency(ratio: float) -> EstimationError | None:
 
 
 def check_coverage(
-    models: Sequence[Any], keyframes: int, textured: int, attempts: object, options: MapOptions
+    models: Sequence[Any],
+    keyframes: int,
+    textured: int,
+    attempts: Sequence[Mapping[str, object]],
+    options: MapOptions,
 ) -> EstimationError | None:
     """Return an error if the largest model holds too few keyframes.
 
@@ -203,7 +207,7 @@ def check_coverage(
         models: The models, largest first.
         keyframes: Number of keyframes of all cameras.
         textured: Number of these keyframes with enough features to be part of a map.
-        attempts: The initial pairs that were tried, for the message.
+        attempts: The initial pairs that were tried, for the message, which names the first reason of failure.
         options: The stage's options. ``min_coverage`` is the minimum fraction of the keyframes with texture
             that the largest model must hold.
 
@@ -211,11 +215,12 @@ def check_coverage(
         The error; None if the largest model holds enough keyframes.
     """
     registered = models[0].num_reg_images() if models else 0
+    reasons = [str(each[key]) for each in attempts for key in ("doubt", "failed") if key in each]
+    because = f"; of the best pair of keyframes to start from, {reasons[0]}" if reasons else ""
     if registered >= max(2, options.min_coverage * textured):
         return None
     return EstimationError(
         f"the map contains only {registered} of {keyframes} keyframes, {textured} of which show texture; it "
-        f"must contain at least {format_percent(options.min_coverage)} of these; the map was started "
-        f"from these pairs of keyframes: {attempts}",
+        f"must contain at least {format_percent(options.min_coverage)} of these{because}",
         hint="move the cameras sideways past bright surfaces with texture; check the calibration",
     )

@@ -59,7 +59,8 @@ class _StatusBar:
     """A bar that represents an interval of frames, or several intervals that a screen cannot separate.
 
     Attributes:
-        kind: Kind of the interval: "reg" (registered), "bridged", "other" (in another map) or "lost".
+        kind: Kind of the interval: "reg" (registered), "bridged", "other" (in another map),
+            "turn" (the rotation alone) or "lost".
         start_s: Common time of the bar's start, seconds.
         end_s: Common time of the bar's end, seconds.
         frames: Number of lost frames.
@@ -287,6 +288,8 @@ def _draw_bars(
     parts = [_draw_bar(bar, span_s, "registered") for bar in _merge_close_bars(registered, resolution_s)]
     for bar in _merge_close_bars(lost_bars, resolution_s):
         title = f"{bar.frames} frames lost: {', '.join(bar.reasons)}"
+        if bar.kind == "turn":
+            title = f"{bar.frames} frames with the rotation alone"
         if bar.kind == "bridged":
             title += ", bridged by the body"
         parts.append(_draw_bar(bar, span_s, title))
@@ -297,13 +300,17 @@ def _frame_interval_s(times: FloatArray) -> float:
     return float(np.median(np.diff(times))) if len(times) > 1 else _DEFAULT_INTERVAL_S
 
 
+_KINDS = {FrameStatus.OTHER_MAP: "other", FrameStatus.ROTATION_ONLY: "turn"}
+"""Kind of the bar of frames that are lost in the map but not without any result."""
+
+
 def _lost_bar(loss: FrameLoss, times: FloatArray, bridged_s: float) -> _StatusBar:
     # The smoothness of the motion bridges a gap between two measurements. The time before the first
     # measurement and the time after the last measurement are not bridged.
     is_between = loss.first > 0 and loss.last < len(times) - 1
     gap_s = float(times[loss.last + 1] - times[loss.first - 1]) if is_between else np.inf
     kind = "bridged" if gap_s <= bridged_s else "lost"
-    kind = "other" if loss.reason is FrameStatus.OTHER_MAP else kind
+    kind = _KINDS.get(loss.reason, kind)
     end_s = loss.end_s + _frame_interval_s(times)
     return _StatusBar(kind, loss.start_s, end_s, loss.frame_count, (loss.reason.value,))
 

@@ -237,3 +237,27 @@ def test_relative_error_of_two_cameras() -> None:
     )
     in_reference = relative_camera_error(bigger, truths, "palm", "torso").in_reference_m
     assert in_reference.mean == pytest.approx(0.2 * span.mean())
+
+
+def test_rotations_without_positions_have_an_alignment_of_their_own() -> None:
+    truth = walk(1)
+    turn = so3_exp([0.3, -0.2, 0.9])
+    alone = truth.world_from_cam.copy()
+    alone[:, :3, :3] = turn @ alone[:, :3, :3]
+    alone[:, :3, 3] = 0.0
+    alone[7, :3, :3] = alone[7, :3, :3] @ so3_exp([np.radians(20.0), 0.0, 0.0])
+    estimates = {
+        "head": TimedPoses(times_ns=truth.times_ns, world_from_cam=alone),
+        "torso": walk(2, phase=1.0),
+    }
+    truths = {"head": truth, "torso": walk(2, phase=1.0)}
+    report = score_trajectories(estimates, truths, frames={"head": 300, "torso": 300})
+    head, torso = report.cameras["head"], report.cameras["torso"]
+    assert (head.registered, head.coverage, head.scored, head.ate_m, head.rpe_m) == (0, 0.0, 300, None, None)
+    assert head.rotation_deg is not None
+    assert head.rotation_deg.max == pytest.approx(20.0, abs=0.2)
+    assert head.rotation_deg.median < 0.1
+    assert torso.ate_m is not None
+    assert torso.ate_m.max < 1e-9  # the other camera does not disturb the common alignment
+    single = score_trajectories({"head": estimates["head"]}, {"head": truth})
+    assert single.total.rotation_deg == head.rotation_deg

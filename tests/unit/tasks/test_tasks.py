@@ -30,6 +30,7 @@ from bodycap_batch.pipeline.inputs import body_input, camera_digest
 from bodycap_batch.store.digests import FileDigests
 from bodycap_batch.tasks.body import mount_prior
 from bodycap_batch.tasks.registration import may_have_rolling_shutter
+from bodycap_batch.tasks.rotations import without_positions
 
 QUARTER_TURN = {"translation_m": [0.1, 0.2, 0.3], "quat_xyzw": [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]}
 
@@ -182,3 +183,20 @@ def test_a_map_is_corrected_again_if_matches_do_not_determine_a_readout(
         log = MapDiagnostics(unknown_shutters=names).to_log()
         scene: Any = SimpleNamespace(maps=(), diagnostics=MapDiagnostics.from_log(log))
         assert may_have_rolling_shutter(SimpleNamespace(), camera, scene) is expected  # type: ignore[arg-type]
+
+
+def test_positions_that_say_nothing_are_found_by_the_links_and_the_sigma() -> None:
+    def camera(**changed: Any) -> dict[str, Any]:
+        link = {"compared": 100, "contradicted": changed.pop("contradicted", 0)}
+        return {"frame": "a", "posed": True, "sigma": 0.1, "extent": 1.0, "links": [link], **changed}
+
+    found = {
+        "right": camera(),
+        "unposed": camera(posed=False, sigma=None, extent=None, links=[]),
+        "wrong": camera(contradicted=6),
+        "nearly": camera(contradicted=5),
+        "noise": camera(frame="b", sigma=0.3),
+        "small": camera(extent=0.2),  # the longest path of its map counts, as for cameras on one body
+        "other": camera(frame="c", posed=True, sigma=None, extent=None),
+    }
+    assert without_positions(found) == ["noise", "unposed", "wrong"]

@@ -38,6 +38,7 @@ from bodycap_batch.tasks.preview import PreviewTask
 from bodycap_batch.tasks.recover import RecoverTask
 from bodycap_batch.tasks.registration import RegistrationTask
 from bodycap_batch.tasks.report import ReportTask
+from bodycap_batch.tasks.rotations import RotationsTask
 from bodycap_batch.tasks.sound import SoundTask
 from bodycap_batch.tasks.stages import STAGES
 from bodycap_batch.tasks.synth import SynthTask
@@ -126,6 +127,7 @@ def tasks(folder: Path) -> dict[str, Any]:
             registration=scene_map,
         ),
         "links": LinksTask(keyframes=scene_map, map=scene_map, registration=scene_map),
+        "rotations": RotationsTask(capture=capture, keyframes=stored, map=scene_map, registration=scene_map),
         "sound": SoundTask(
             capture=capture,
         ),

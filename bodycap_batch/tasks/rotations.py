@@ -1,0 +1,125 @@
+"""The task that measures the rotations of a camera whose positions are not known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bodycap_batch.config.path_bounds import MAX_CONTRADICTED, MAX_UNCERTAINTY
+from bodycap_batch.core.context import StageContext
+from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
+from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
+from bodycap_batch.tasks.registered_cameras import INERTIAL_CAMERA
+from bodycap_batch.tasks.registration import save_registration
+from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, read_summary
+
+if TYPE_CHECKING:
+    from bodycap_batch.model.camera import Camera
+    from bodycap_batch.model.scene import KeyframeSelection, Map, Trajectory
+
+_PROGRESS_FRAMES = 10
+"""Number of frames between two reports of progress."""
+_START_SIGMA = 0.3
+"""Relative standard deviation of the focal length of a lens that is neither given nor measured: usual lenses
+of worn cameras have 60° to 120°. Evidence: none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RotationsTask:
+    """Measure the rotations of one camera, and withdraw its positions.
+
+    Attributes:
+        capture: The video of the camera.
+        keyframes: The camera's selected keyframes, by camera name (one entry).
+        map: All maps.
+        registration: The camera's registration.
+    """
+
+    capture: CaptureRef
+    keyframes: Mapping[str, ArtefactRef]
+    map: ArtefactRef
+    registration: ArtefactRef
+
+
+def without_positions(links: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return the names of the cameras whose positions say nothing.
+
+    They have no pose, or the video contradicts their path, or the positions are as uncertain as the path is
+    long.
+
+    Args:
+        links: The summaries of the stage `links`, by camera name.
+    """
+    longest = dict[str, float]()
+    for each in links.values():
+        longest[each["frame"]] = max(longest.get(each["frame"], 0.0), each["extent"] or 0.0)
+    out = []
+    for name, each in links.items():
+        compared = sum(path["compared"] for path in each["links"])
+        wrong = sum(path["contradicted"] for path in each["links"])
+        is_noise = (each["sigma"] or 0.0) > MAX_UNCERTAINTY * longest[each["frame"]]
+        if not each["posed"] or is_noise or wrong > MAX_CONTRADICTED * compared:
+            out.append(name)
+    return sorted(out)
+
+
+def run_rotations(task: RotationsTask, context: StageContext, files: Path) -> None:
+    """Store the camera's registration with its rotations alone; as it was if the camera moves."""
+    from dataclasses import replace
+
+    from bodycap_batch.core.mechanisms import Mechanism, record_act
+    from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
+    from bodycap_batch.model.inertial_camera import InertialCamera
+    from bodycap_batch.tracks import measure_mere_turn, rotations_alone, track_video
+
+    camera = load_capture(task.capture, task.keyframes, threads=context.threads).cameras[0]
+    selection = load_keyframes(task.keyframes[camera.name].path)
+    before = load_registration(task.registration.path)
+    scene = _map_of(task.map.path, before.trajectory)
+
+    def show(done: int, total: int) -> None:
+        context.check_cancelled()
+        if done % _PROGRESS_FRAMES == 0:
+            context.progress(done, total, "frames followed")
+
+    tracks = track_video(camera, show)
+    if len(selection.moving_regions):
+        tracks = tracks.outside(selection.moving_regions)
+    context.progress(0, 0, "measuring how the camera turns")
+    lens, lens_sigma = _lens(camera.camera, selection)
+    turn = measure_mere_turn(tracks, lens.scaled(tracks.width_px, tracks.height_px), lens_sigma)
+    record_act(Mechanism.MERE_TURN, int(turn is not None))
+    found = before
+    if turn is not None:
+        found = replace(before, trajectory=rotations_alone(before.trajectory, turn, scene))
+    rolling = bool(read_summary(task.registration.path)["rolling"])
+    save_registration(found, camera, files, rolling=rolling)
+    if (task.registration.path / f"{INERTIAL_CAMERA}.json").exists():
+        sensor = read_dataclass(InertialCamera, task.registration.path, INERTIAL_CAMERA)
+        write_dataclass(sensor, files, INERTIAL_CAMERA)
+
+
+def _map_of(path: Path, trajectory: Trajectory) -> Map | None:
+    """Return the map of a path, or the empty map; None if no map contains the camera."""
+    maps = load_map(path).maps
+    return next((each for each in maps if each.gauge == trajectory.gauge or not each.keyframe_camera), None)
+
+
+def _lens(start: Camera, selection: KeyframeSelection) -> tuple[Camera, float]:
+    """Return the lens of the camera and the relative sigma of its focal length."""
+    if not start.refine:
+        return start, 0.0
+    return (
+        (start, _START_SIGMA) if selection.lens is None else (selection.lens.lens, selection.lens.focal_sigma)
+    )
+
+
+ROTATIONS = Stage(
+    name="rotations",
+    task=RotationsTask,
+    function=run_rotations,
+    libraries=(*VISION_LIBRARIES, "pycolmap", "scipy"),
+    modules=(*VISION_MODULES, "pycolmap"),
+)
