@@ -56,7 +56,6 @@ class Mechanism(StrEnum):
     GAP_FILLING = "gap_filling"
     SENSOR_PATH = "sensor_path"
     FURTHER_MAPS = "further_maps"
-    LARGER_MODEL = "larger_model"
     MERE_TURN = "mere_turn"
     CONTINUITY = "continuity"
     MOUNT_SLIPS = "mount_slips"

@@ -50,7 +50,6 @@ from bodycap_batch.mapping.model_joining import join_models
 from bodycap_batch.mapping.reconstruction.mapper_options import MIN_RESECTION_INLIERS
 from bodycap_batch.mapping.reconstruction.model_files import write_models
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
-from bodycap_batch.mapping.unmapped_keyframes import with_larger_model
 from bodycap_batch.mapping.validation.epipolar_consistency import check_consistency, check_coverage
 from bodycap_batch.mapping.validation.remaining_keyframes import resect_remaining
 from bodycap_batch.mapping.validation.repair import left_contradicted, remove_without_adjustment, repair_model
@@ -238,19 +237,11 @@ def build_map_once(
     refused = add_flip_hint(check_coverage(models, len(refs), textured, attempts, options), flips)
     if refused is not None and not models:
         raise refused
-    models, displaced = with_larger_model(
-        models,
-        {ref.name for ref in refs},
-        max(log["repair"]["contradicted_share"], ratio),
-        mapping.with_rotation_chains(capture),
-    )
     write_models(workspace, models)
     calibrated = {number: name for name, number in ids.items() if number in mapping.given_ids}
     misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
     removed = [name for step in ("repair", "placed") if step in log for name in log[step]["cut"]]
-    misplaced = misplaced_frames(
-        [*removed, *log.get("contradicting", ()), *displaced], models[:1] if displaced else models
-    )
+    misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
     if readouts:
         log["readouts_from_matches"] = {name: asdict(item) for name, item in sorted(readouts.items())}
     unknown = unknown_shutters(capture, selections, readouts)

@@ -40,7 +40,6 @@ from bodycap_batch.mapping.reconstruction.model_files import (
     write_models,
 )
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
-from bodycap_batch.mapping.unmapped_keyframes import with_larger_model
 from bodycap_batch.mapping.validation.repair import remove_without_adjustment
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.scene import MapResult
@@ -71,8 +70,7 @@ def extend_map(
         skeletal_above: Maximum number of keyframes of a map that is not large (`MappingContext.is_large`).
 
     Returns:
-        The models, largest first, each in a new gauge: the extended ones and, if most keyframes are in none
-        of these, models of the others.
+        The extended models, largest first, each in a new gauge.
     """
     import pycolmap
 
@@ -116,20 +114,12 @@ def extend_map(
         removed += cut
         resected.append(registered_ids(model) - kept if mapping.is_large(len(kept)) else None)
     transient = finalise_models(models, mapping, resected)
-    contradicted = [float(previous.log.get("repair", {}).get("contradicted_share", 0.0))]
     for number, model in enumerate(models):
-        models[number], names, ratio = remove_without_adjustment(model, mapping)
-        contradicted.append(ratio)
+        models[number], names, _ = remove_without_adjustment(model, mapping)
         removed += names
         # A removed keyframe may have connected others with the room.
         transient += remove_points_on_wearer(models[number])
     models.sort(key=model_order)
-    models, displaced = with_larger_model(
-        models,
-        {ref.name for ref in (*existing, *new)},
-        max(contradicted),
-        mapping.with_rotation_chains(capture),
-    )
     write_models(workspace, models)
     entry = {
         "new_keyframes": len(new),
@@ -144,7 +134,7 @@ def extend_map(
     ]
     diagnostics = replace(
         diagnostics,
-        misplaced=misplaced_frames([*before, *removed, *displaced], models[:1] if displaced else models),
+        misplaced=misplaced_frames([*before, *removed], models),
         extensions=(*diagnostics.extensions, entry),
         details={**diagnostics.details, "keyframes": len(existing) + len(new)},
     )

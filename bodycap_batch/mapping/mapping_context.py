@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bodycap_batch.capture import Capture
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.mechanisms import Mechanism, is_on
@@ -46,12 +45,6 @@ class MappingContext:
     times_ns: Mapping[str, IntArray] = field(default_factory=dict)
     lens_sigma: Mapping[int, float] = field(default_factory=dict)
     rotation_chains: Mapping[str, RotationChain | None] = field(default_factory=dict)
-
-    def with_rotation_chains(self, capture: Capture) -> MappingContext:
-        """Return this context for models that the rotation of the videos judges, too."""
-        return replace(
-            self, rotation_chains={camera.name: camera.rotation_chain for camera in capture.cameras}
-        )
 
     @property
     def given_ids(self) -> frozenset[int]:
