@@ -277,7 +277,7 @@ class _Problem:
         weights = self.share * (residual_px <= _INLIER_PX)
         follow = np.bincount(self.frame, weights, minlength=len(self.counts))
         area = np.bincount(self.frame, self.share, minlength=len(self.counts))
-        return np.asarray(follow / np.maximum(area, 1e-12)), follow
+        return np.asarray(follow / np.maximum(area, 1e-12)), np.asarray(follow, dtype=np.float64)
 
     def linked(self, residual_px: FloatArray, frames: IntArray) -> BoolArray:
         """Return which of some frames form the longest part with enough points from each frame to the next.
