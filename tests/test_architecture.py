@@ -43,7 +43,7 @@ SUBLAYERS: dict[str, Sequence[set[str]]] = {
         {"inputs", "model_joining"},
         {"results"},
         {"unmapped_keyframes"},
-        {"build", "extend", "further_maps", "refine"},
+        {"build", "empty_map", "extend", "further_maps", "refine"},
     ),
     "registration": ({"tracking"}, {"poses"}, {"recovery"}, {"stage"}, {"further_maps"}),
     "fill": (
