@@ -42,7 +42,6 @@ SUBLAYERS: dict[str, Sequence[set[str]]] = {
         {"validation", "initial_models"},
         {"inputs", "model_joining"},
         {"results"},
-        {"unmapped_keyframes"},
         {"build", "empty_map", "extend", "further_maps", "refine"},
     ),
     "registration": ({"tracking"}, {"poses"}, {"recovery"}, {"stage"}, {"further_maps"}),
