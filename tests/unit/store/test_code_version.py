@@ -185,6 +185,7 @@ HASHED = {
         CAMERAS | {"mapping", "registration", "inertial", "telemetry"},
     ),
     "links": CAMERAS | {"evaluate", "tracks"},
+    "rotations": CAMERAS | {"registration", "inertial", "telemetry", "tracks"},
     # Merging reads marker boards from the images, and explains a failure by mirrored cameras.
     "merge": BODY | {"merging", "calibration", "mapping"},
     "fill": BODY | {"fill"},
@@ -345,7 +346,7 @@ def test_code_for_output_does_not_count(copied: Path) -> None:
 
 def test_the_conditions_of_recovery_count(copied: Path) -> None:
     # All that store a registration, and the maps of lost frames.
-    stages = {"registration", "recover", "inertial", *MAPPING}
+    stages = {"registration", "recover", "rotations", "inertial", *MAPPING}
     assert changed_by(copied / "config" / "lost_frames.py") == stages
 
 
