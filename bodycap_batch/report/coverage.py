@@ -132,7 +132,8 @@ class Coverage:
         """The coverage in words: the share of the frames, and the camera with the smallest share."""
         every = f"{format_percent(self.share, 1)} of the frames"
         if self.rotation_only:
-            every += f", and the rotation alone of {format_percent(self.rotation_only / self.frames, 1)}"
+            alone = f"the rotation alone of {format_percent(self.rotation_only / self.frames, 1)}"
+            every = f"{every}, and {alone}" if self.share else f"{alone} of the frames"
         if self.share == 1.0 or len(self.cameras) < 2:
             return every
         return f"{every}; {self.worst} {format_percent(self.cameras[self.worst].share, 1)}"
