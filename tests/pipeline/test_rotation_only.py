@@ -15,6 +15,7 @@ from bodycap_batch.formats.tum import TimedPoses, write_tum
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import make_transform
 from bodycap_batch.model.scene import FrameStatus
+from tests.bench.paired.measures import rotations_alone
 from tests.pipeline.hard_captures import rows_of, run
 from tests.rooms import LENS, Room, look
 from tests.schemas import problems
@@ -62,6 +63,8 @@ def test_all_frames_have_the_right_rotation(turned: Path, capsys: pytest.Capture
     score = json.loads(capsys.readouterr().out)["trajectories"]["cameras"]["head"]
     assert score["scored"] == FRAMES
     assert score["registered"] == 0
+    assert rotations_alone(turned, truth)[0] == FRAMES
+    assert (rotations_alone(turned, truth)[1] or 9.0) < 0.3
     assert score["ate_m"] is None
     assert score["rotation_deg"]["max"] < 0.3
     sigma = np.array([float(row["sigma_rotation_deg"]) for row in rows_of(turned.parent / "capture")])

@@ -265,6 +265,24 @@ def frame_counts(results: Path) -> tuple[int, int]:
     return sum(len(frames.status) for frames in found.frames().values()), posed
 
 
+def rotations_alone(results: Path, truth: Path | None) -> tuple[int, float | None]:
+    """Return the number of frames with a rotation and no position, and their median error in degrees."""
+    count, errors = 0, list[FloatArray]()
+    for name, path in sorted(Result(results).trajectories().items()):
+        turned = path.frames.rotation_only
+        count += int(turned.sum())
+        if truth is None or not turned.any():
+            continue
+        known = shown_truth(truth) / f"{name}.tum" if truth.is_dir() else truth
+        if not known.exists():
+            continue
+        true, found = interpolate_truth(read_tum(known), path.frames.times_ns[turned])
+        mine = path.rotations[turned][found]
+        if len(mine) >= _LEAST:
+            errors.append(rotation_errors_deg(mine, true[found, :3, :3], is_measured=False))
+    return count, float(np.median(np.concatenate(errors))) if errors else None
+
+
 def digest_of_results(results: Path) -> str:
     """Return a digest of poses, map, lenses and motion. Comments, which name versions, do not count."""
     digest = hashlib.sha256()

@@ -102,6 +102,8 @@ class RunRecord:
         memory_mb: Largest memory of a task; None if it is unknown.
         frames: Number of frames of all cameras.
         posed: Number of frames with a pose in the main map.
+        rotations: Number of frames with a rotation and no position.
+        rotations_deg: Median error of these rotations; None without a truth.
         models: Number of maps.
         digest: Digest of the poses, the map and the motion; empty without results.
         grade: Word of the grade of the cameras, by the code of the side.
@@ -126,6 +128,8 @@ class RunRecord:
     memory_mb: float | None = None
     frames: int = 0
     posed: int = 0
+    rotations: int = 0
+    rotations_deg: float | None = None
     models: int = 0
     digest: str = ""
     grade: str = ""
@@ -321,10 +325,13 @@ def _measure(side: Side, capture: BenchCapture, folder: Path) -> dict[str, Any]:
     out = folder / "out"
     record = Result(out).record()
     frames, posed = measures.frame_counts(out)
+    rotations, rotations_deg = measures.rotations_alone(out, capture.truth)
     values: dict[str, Any] = {
         "memory_mb": record.get("peak_memory_mb"),
         "frames": frames,
         "posed": posed,
+        "rotations": rotations,
+        "rotations_deg": rotations_deg,
         "models": len(list((out / "colmap").glob("*/"))),
         "digest": measures.digest_of_results(out),
         "grade": _grade(side, out / "metrics.json"),

@@ -41,7 +41,7 @@ def run_cells(run: RunRecord) -> list[str]:
     return [
         run.capture,
         str(run.frames),
-        str(run.posed),
+        f"{run.posed} + {run.rotations} rotations" if run.rotations else str(run.posed),
         _number(run.right),
         _number(run.wrong),
         f"{seen.right}/{seen.wrong}/{seen.unmeasurable}" if seen else "-",
@@ -51,9 +51,13 @@ def run_cells(run: RunRecord) -> list[str]:
         f"{run.cpu_s:.0f}",
         f"{run.cpu_s / run.right:.2f}" if run.right else "-",
         f"{100 * run.truth.ate_m:.2f}" if run.truth else "-",
-        f"{run.truth.median_deg:.2f}" if run.truth else "-",
+        _degrees(run.truth.median_deg if run.truth else run.rotations_deg),
         f"{run.lens['0.4']:.2f}" if "0.4" in run.lens else "-",
     ]
+
+
+def _degrees(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
 
 
 def run_table(runs: Sequence[RunRecord]) -> list[str]:
