@@ -56,6 +56,10 @@ _MIN_CELLS = 8.0
 frames."""
 _MAX_SIGMA_RAD = float(np.deg2rad(5.0))
 """Maximum standard deviation of the rotations per axis, as for the rotation between two frames."""
+_LEVER_SIGMA = 0.15
+"""Standard deviation of the turned angles, as a share: a head turns about a neck some 10 cm behind the
+camera, and a table is 0.7 m away. No picture of a flat table tells this motion from a turn. Evidence:
+docs/decisions/tracks.md."""
 _ROOM_SIGMA = 0.3
 """Standard deviation of the camera's position in the second solution, as a share of the distance to the room.
 It only keeps frames with few points from leaving the room."""
@@ -72,14 +76,15 @@ class MereTurn:
     Attributes:
         first_from_cam: (N,3,3) rotation of each frame in the axes of the first measured one; NaN for a frame
             that does not show it.
-        sigma_rad: Standard deviation of each rotation per axis: root mean square over the frames.
+        sigma_rad: (N,) standard deviation of each rotation per axis.
     """
 
     first_from_cam: FloatArray
-    sigma_rad: float
+    sigma_rad: FloatArray
 
     def __post_init__(self) -> None:
         set_array(self, "first_from_cam", (None, 3, 3), finite=False)
+        set_array(self, "sigma_rad", (len(self.first_from_cam),), finite=False)
 
     @property
     def measured(self) -> BoolArray:
@@ -123,15 +128,16 @@ def measure_mere_turn(tracks: PointTracks, lens: Camera, lens_sigma: float = 0.0
     count = np.isfinite(squares).sum(axis=0)
     # The variance of the mean of the quarters: their own is that of one quarter.
     deviations.append(np.sqrt(np.nansum(squares, axis=0) / np.maximum(count * (count - 1), 1)))
-    # A wrong focal length makes all angles too large or too small.
-    still = np.broadcast_to(np.eye(3), turn.shape)
-    deviations.append(lens_sigma * _deviation(still, turn, shown))
-    sigma_rad = float(np.sqrt(np.sum(np.square(deviations), axis=0)[shown].mean() / 3.0))
-    if sigma_rad > _MAX_SIGMA_RAD:
+    # The error of a single frame is not known: these deviations show that of all frames.
+    variance = np.sum(np.square(deviations), axis=0)[shown].mean()
+    # A wrong focal length, and a camera before the joint about which it turns, change all angles by a ratio.
+    angle = _deviation(np.broadcast_to(np.eye(3), turn.shape), turn, shown)
+    sigma_rad = np.sqrt((variance + (lens_sigma**2 + _LEVER_SIGMA**2) * angle**2) / 3.0)
+    if np.sqrt((sigma_rad[shown] ** 2).mean()) > _MAX_SIGMA_RAD:
         return None
     first = turn[np.argmax(shown)]
     rotations = np.where(shown[:, None, None], first.T @ turn, np.nan)
-    return MereTurn(first_from_cam=rotations, sigma_rad=sigma_rad)
+    return MereTurn(first_from_cam=rotations, sigma_rad=np.where(shown, sigma_rad, np.nan))
 
 
 def rotations_alone(path: Trajectory, turn: MereTurn, scene: Map | None) -> Trajectory:
@@ -155,7 +161,7 @@ def rotations_alone(path: Trajectory, turn: MereTurn, scene: Map | None) -> Traj
     poses[turn.measured, :3, 3] = np.nan
     poses[turn.measured, :3, :3] = gauge_from_first @ turn.first_from_cam[turn.measured]
     covariance = np.full((len(poses), 6, 6), np.nan)
-    covariance[turn.measured, :3, :3] = turn.sigma_rad**2 * np.eye(3)
+    covariance[turn.measured, :3, :3] = turn.sigma_rad[turn.measured, None, None] ** 2 * np.eye(3)
     had_position = path.localised | np.array([each is FrameStatus.OTHER_MAP for each in path.status])
     lost = np.where(had_position, FrameStatus.UNCONSTRAINED, path.status)
     return replace(

@@ -68,7 +68,7 @@ def test_all_frames_have_the_right_rotation(turned: Path, capsys: pytest.Capture
     assert score["ate_m"] is None
     assert score["rotation_deg"]["max"] < 0.3
     sigma = np.array([float(row["sigma_rotation_deg"]) for row in rows_of(turned.parent / "capture")])
-    assert score["rotation_deg"]["max"] < 2.8 * sigma[0] < 1.0  # the region of 95 % of three axes
+    assert score["rotation_deg"]["max"] < 2.8 * sigma.mean() < 2.0  # the region of 95 % of three axes
 
 
 def test_no_file_claims_a_position(turned: Path) -> None:

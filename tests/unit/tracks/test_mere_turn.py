@@ -52,8 +52,9 @@ def test_the_rotations_of_a_camera_that_only_turns_are_exact(hand_m: float) -> N
     found = measure_mere_turn(tracks(0.0, hand_m), LENS)
     assert found is not None
     assert found.measured.all()
-    assert errors_deg(found.first_from_cam).max() < (0.1 if hand_m else 0.05)
-    assert np.degrees(found.sigma_rad) < 0.1
+    errors = errors_deg(found.first_from_cam)
+    assert errors.max() < (0.1 if hand_m else 0.05)
+    assert (errors < 2.8 * np.degrees(found.sigma_rad)).all()
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -64,7 +65,7 @@ def test_a_small_motion_is_part_of_the_sigma(seed: int) -> None:
     assert 0.1 < errors.max() < 0.6  # 1 cm in 1 m is 0.6 degrees
     # The region of 95 % of three axes is 2.8 sigma.
     assert (errors < 2.8 * np.degrees(found.sigma_rad)).mean() > 0.85
-    assert np.degrees(found.sigma_rad) < 0.5
+    assert np.degrees(found.sigma_rad).max() < 1.0
 
 
 def test_a_camera_that_moves_has_no_mere_turn() -> None:
@@ -75,7 +76,7 @@ def test_an_uncertain_lens_makes_the_angles_uncertain() -> None:
     exact, uncertain = (measure_mere_turn(tracks(0.0), LENS, sigma) for sigma in (0.0, 0.2))
     assert exact is not None
     assert uncertain is not None
-    assert uncertain.sigma_rad > 10 * exact.sigma_rad
+    assert uncertain.sigma_rad.max() > 1.5 * exact.sigma_rad.max()
     assert measure_mere_turn(tracks(0.0), LENS, 5.0) is None
 
 
@@ -111,7 +112,7 @@ def test_a_path_of_rotations_alone_has_the_axes_of_its_map() -> None:
     assert not turned.localised.any()
     assert np.isnan(turned.gauge_from_cam[:, :3, 3]).all()
     assert np.allclose(turned.poses_at_origin()[:, :3, 3], 0.0)
-    assert np.allclose(turned.covariance[:, :3, :3], found.sigma_rad**2 * np.eye(3))
+    assert np.allclose(turned.covariance[:, :3, :3], found.sigma_rad[:, None, None] ** 2 * np.eye(3))
     assert np.isnan(turned.covariance[:, 3:, 3:]).all()
     # Of all common turns, the path has the one that is nearest to the keyframes of the map.
     frames, rotations = scene.keyframe_frame[own], scene.map_from_cam[own, :3, :3]
