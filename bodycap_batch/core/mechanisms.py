@@ -57,6 +57,7 @@ class Mechanism(StrEnum):
     SENSOR_PATH = "sensor_path"
     FURTHER_MAPS = "further_maps"
     MERE_TURN = "mere_turn"
+    FREED_LENSES = "freed_lenses"
     CONTINUITY = "continuity"
     MOUNT_SLIPS = "mount_slips"
     LYING = "lying"

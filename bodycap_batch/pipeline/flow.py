@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import replace
 from functools import cached_property, partial
@@ -11,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_MAPPED, LEAST_POSED
-from bodycap_batch.config.models import CameraConfig, Job
+from bodycap_batch.config.models import CameraConfig, CaptureConfig, Job
 from bodycap_batch.config.mounts import MOTION_PLACES, TRUNK_ROLES, mount_of
+from bodycap_batch.config.path_bounds import MAX_CONTRADICTED
 from bodycap_batch.core.errors import BodycapError, CaptureError, EstimationError, JobError
 from bodycap_batch.core.mechanisms import Mechanism, is_on
 from bodycap_batch.core.progress import RECONSTRUCTION, Event
@@ -55,7 +57,7 @@ from bodycap_batch.tasks.preview import PREVIEW
 from bodycap_batch.tasks.recover import RECOVER, RecoverTask
 from bodycap_batch.tasks.registration import REGISTRATION, RegistrationTask
 from bodycap_batch.tasks.report import REPORT
-from bodycap_batch.tasks.rotations import ROTATIONS, RotationsTask, without_positions
+from bodycap_batch.tasks.rotations import ROTATIONS, RotationsTask, contradicted_share, without_positions
 from bodycap_batch.tasks.sound import SOUND, SoundTask, known_from_sound
 from bodycap_batch.tasks.stage import Stage, read_summary
 from bodycap_batch.tasks.undistort import UNDISTORT, UndistortTask
@@ -88,6 +90,7 @@ class Flow:
         self._cameras: dict[str, str] = {}
         self._map_round = 0
         self._map_failure: EstimationError | None = None
+        self.freed: tuple[str, ...] = ()
         self._with_telemetry = frozenset[str]()
         self._with_gyro = frozenset[str]()
         self._stabilised = frozenset[str]()
@@ -464,6 +467,38 @@ class Flow:
             for name, registration in registrations.items()
         )
 
+    def with_freed_lenses(self, links: ByCamera) -> Flow | None:
+        """Return the flow of the same job with unknown lenses, for cameras whose path the video contradicts.
+
+        A given lens that is some percent wrong bends the map, and a map of few points does not show it. A
+        wrong lens is the first suspect. The flow shares the tasks and records of this one.
+
+        Returns:
+            None if no path of a camera with a given lens is contradicted.
+        """
+        given = self._job.capture.calibration
+        suspects = {
+            camera.name
+            for camera in self._job.capture.cameras
+            if (camera.calibration if camera.calibration is not None else given) not in (None, "auto")
+            and contradicted_share(read_summary(links[camera.name].path)) > MAX_CONTRADICTED
+        }
+        if not suspects or not is_on(Mechanism.FREED_LENSES):
+            return None
+        out = copy.copy(self)
+        out.freed = tuple(sorted(suspects))
+        out._job, out._capture = (
+            self._job.model_copy(update={"capture": _with_unknown_lenses(self._job.capture, suspects)}),
+            _with_unknown_lenses(self._capture, suspects),
+        )
+        out._map_round, out._map_failure = 0, None
+        out.identify_videos()
+        return out
+
+    def shows_lenses(self, keyframes: ByCamera) -> bool:
+        """Return whether the tracks of the videos determine all freed lenses."""
+        return all(read_summary(keyframes[name].path)["lens"] for name in self.freed)
+
     def measure_rotations(
         self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera, links: ByCamera
     ) -> tuple[ByCamera, ByCamera]:
@@ -774,6 +809,15 @@ def _unknown_places(cameras: Sequence[str], reason: str) -> EstimationError:
         hint=f"look at the videos, and give the places: {stated} (one of {', '.join(MOTION_PLACES)}); the "
         "stages that are finished are not computed again",
     )
+
+
+def _with_unknown_lenses(capture: CaptureConfig, cameras: Container[str]) -> CaptureConfig:
+    """Return a capture in which the lenses of some cameras are unknown."""
+    changed = tuple(
+        camera.model_copy(update={"calibration": "auto"}) if camera.name in cameras else camera
+        for camera in capture.cameras
+    )
+    return capture.model_copy(update={"cameras": changed})
 
 
 def _posed_frames(registrations: ByCamera) -> int:

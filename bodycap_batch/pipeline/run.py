@@ -14,6 +14,7 @@ import bodycap_batch
 from bodycap_batch.config.folder import PARTIAL, RUN_FILE
 from bodycap_batch.config.models import Job
 from bodycap_batch.config.overrides import COMMAND_LINE, values_to_record
+from bodycap_batch.config.path_bounds import MAX_CONTRADICTED
 from bodycap_batch.core.errors import (
     BodycapError,
     Cancelled,
@@ -38,7 +39,8 @@ from bodycap_batch.report.summary import ResultSummary, summary_of_folder
 from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.store.checked_json import checked_json
 from bodycap_batch.tasks.order import STAGE_ORDER
-from bodycap_batch.tasks.stage import RESULTS_FOLDER
+from bodycap_batch.tasks.rotations import confirmed_frames, contradicted_share
+from bodycap_batch.tasks.stage import RESULTS_FOLDER, read_summary
 
 JOB_FILE = "job.yaml"
 REPORT_FILE = "report.html"
@@ -120,28 +122,13 @@ def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
     """
     flow.check()
     yield "check"
-    results.stage = "keyframes"
-    results.keyframes = keyframes = flow.keyframes()
-    yield "keyframes"
-    results.stage = "map"
-    results.map = scene_map = flow.map(keyframes)
-    yield "map"
-    results.stage = "registration"
-    results.registrations = found = flow.register(scene_map, keyframes)
-    scene_map, found = flow.extend_map(scene_map, found, keyframes)
-    results.map, found = flow.refine_map(scene_map, found, keyframes)
-    results.registrations = flow.recover(results.map, found, keyframes)
-    try:
-        results.job = job = flow.find_places(results.map, results.registrations)
-    except EstimationError as error:  # only the body needs the places
-        results.failure = error
-    results.clocks = flow.clocks(results.map, results.registrations)
-    found = flow.use_sensors(results.registrations)
-    results.map, results.registrations = flow.map_lost_parts(results.map, found, keyframes)
-    links = flow.compare_with_tracks(results.map, results.registrations, keyframes)
+    yield from _run_to_paths(flow, results)
+    flow = _with_better_lenses(flow, results)
+    job = results.job or job
+    assert results.map is not None
     try:
         results.registrations, results.links = flow.measure_rotations(
-            results.map, results.registrations, keyframes, links
+            results.map, results.registrations, results.keyframes, results.links
         )
     except EstimationError:  # there is no map
         results.stage, results.map, results.clocks, results.registrations = "map", None, None, {}
@@ -163,6 +150,63 @@ def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
     if results.preview is not None:
         results.previewed = results.preview.result()
         yield "preview"
+
+
+def _run_to_paths(flow: Flow, results: StageResults) -> Iterator[str]:
+    """Run the stages up to the final paths of the cameras, as `run_stages` does."""
+    results.stage = "keyframes"
+    results.keyframes = keyframes = flow.keyframes()
+    yield "keyframes"
+    results.stage = "map"
+    results.map = scene_map = flow.map(keyframes)
+    yield "map"
+    results.stage = "registration"
+    results.registrations = found = flow.register(scene_map, keyframes)
+    scene_map, found = flow.extend_map(scene_map, found, keyframes)
+    results.map, found = flow.refine_map(scene_map, found, keyframes)
+    results.registrations = flow.recover(results.map, found, keyframes)
+    try:
+        results.job = flow.find_places(results.map, results.registrations)
+    except EstimationError as error:  # only the body needs the places
+        results.failure = error
+    results.clocks = flow.clocks(results.map, results.registrations)
+    found = flow.use_sensors(results.registrations)
+    results.map, results.registrations = flow.map_lost_parts(results.map, found, keyframes)
+    results.links = flow.compare_with_tracks(results.map, results.registrations, keyframes)
+
+
+def _with_better_lenses(flow: Flow, results: StageResults) -> Flow:
+    """Compute the paths again without given lenses that may be wrong, and put them into `results` if better.
+
+    Returns:
+        The flow of the results.
+    """
+    other = flow.with_freed_lenses(results.links)
+    if other is None:
+        return flow
+    found, names = StageResults(), ", ".join(other.freed)
+    try:
+        for stage in _run_to_paths(other, found):
+            if stage == "keyframes" and not other.shows_lenses(found.keyframes):
+                return flow
+    except EstimationError as error:
+        flow.runner.note(f"{names}: without the given lens there is no better map: {error.message}", "map")
+        return flow
+    before, after = (
+        {name: read_summary(each.path) for name, each in links.items()}
+        for links in (results.links, found.links)
+    )
+    is_right = all(contradicted_share(after[name]) <= MAX_CONTRADICTED for name in other.freed)
+    if not is_right or confirmed_frames(after) <= confirmed_frames(before):
+        return flow
+    flow.runner.note(
+        f"{names}: the video contradicts the path with the given lens and confirms one with a lens that is "
+        "estimated from the video; this one is used",
+        "map",
+    )
+    for name in ("keyframes", "map", "registrations", "links", "clocks", "job", "failure"):
+        setattr(results, name, getattr(found, name))
+    return other
 
 
 def _run_until(

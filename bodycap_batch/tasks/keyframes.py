@@ -89,7 +89,13 @@ def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> No
     notes = [f"{camera.name}: {note}" for note in [*copies, *damage_notes(camera, selection.damaged)]]
     notes += frozen_notes(camera.name, selection.frozen, camera.common_times_ns() / 1e9)
     notes += [*telemetry_notes, *fixed_notes(camera.name, regions)]
-    write_summary(files, frames=selection.frame_count, keyframes=len(selection.frames), notes=notes)
+    write_summary(
+        files,
+        frames=selection.frame_count,
+        keyframes=len(selection.frames),
+        lens=lens is not None and lens.is_determined,
+        notes=notes,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

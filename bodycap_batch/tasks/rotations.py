@@ -43,6 +43,22 @@ class RotationsTask:
     registration: ArtefactRef
 
 
+def contradicted_share(links: Mapping[str, Any]) -> float:
+    """Return the share of the compared frames of a camera, in all maps, that the video contradicts.
+
+    Args:
+        links: The summary of the stage `links`.
+    """
+    compared = sum(path["compared"] for path in links["links"])
+    return float(sum(path["contradicted"] for path in links["links"]) / max(compared, 1))
+
+
+def confirmed_frames(links: Mapping[str, Mapping[str, Any]]) -> int:
+    """Return the number of compared frames that the videos confirm, of all cameras."""
+    paths = [path for each in links.values() for path in each["links"]]
+    return int(sum(path["compared"] - path["contradicted"] for path in paths))
+
+
 def without_positions(links: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return the names of the cameras whose positions say nothing.
 
@@ -57,10 +73,8 @@ def without_positions(links: Mapping[str, Mapping[str, Any]]) -> list[str]:
         longest[each["frame"]] = max(longest.get(each["frame"], 0.0), each["extent"] or 0.0)
     out = []
     for name, each in links.items():
-        compared = sum(path["compared"] for path in each["links"])
-        wrong = sum(path["contradicted"] for path in each["links"])
         is_noise = (each["sigma"] or 0.0) > MAX_UNCERTAINTY * longest[each["frame"]]
-        if not each["posed"] or is_noise or wrong > MAX_CONTRADICTED * compared:
+        if not each["posed"] or is_noise or contradicted_share(each) > MAX_CONTRADICTED:
             out.append(name)
     return sorted(out)
 

@@ -38,6 +38,8 @@ _SCALE_FALL = 0.85
 docs/decisions/tracks.md."""
 _ITERATIONS = 40
 """Number of iterations of a solution. Evidence: docs/decisions/tracks.md."""
+_REFINEMENTS = 15
+"""Number of iterations of a solution that starts from another one. Evidence: none."""
 _TURN_ITERATIONS = 12
 """Number of iterations for the turn between two frames: the last one has the last scale."""
 _INLIER_PX = 3.0
@@ -65,6 +67,8 @@ _ROOM_SIGMA = 0.3
 It only keeps frames with few points from leaving the room."""
 _NOISE_PX = 0.6
 """Standard deviation of a track in the second solution, px of an image with a long side of 640 px."""
+_MAX_OBSERVATIONS = 1_000_000
+"""Maximum number of observations, so that ten minutes need no more than some 300 MB: 55 points a frame."""
 _CHUNK = 1 << 16
 """Number of observations whose derivatives are in memory at the same time."""
 
@@ -215,8 +219,10 @@ class _Problem:
     @staticmethod
     def create(tracks: PointTracks, lens: Camera) -> _Problem:
         rays = unit_directions(lens.unproject(tracks.px.astype(np.float64)))
-        often = np.bincount(tracks.track) > 1  # what one frame alone shows says nothing
-        seen = np.isfinite(rays).all(axis=1) & often[tracks.track]
+        # What one frame alone shows says nothing. Of a long video, a part of the tracks is enough.
+        kept = np.bincount(tracks.track) > 1
+        kept[np.arange(len(kept)) % -(-len(rays) // _MAX_OBSERVATIONS) > 0] = False
+        seen = np.isfinite(rays).all(axis=1) & kept[tracks.track]
         frame = np.repeat(np.arange(tracks.frame_count), np.diff(tracks.first))
         place = tracks.px / (tracks.width_px, tracks.height_px)
         column, row = np.clip((place * _GRID).astype(np.int64), 0, np.array(_GRID) - 1).T
@@ -250,7 +256,8 @@ class _Problem:
         """Solve the rotations and the directions of the points in turn, by reweighted least squares.
 
         Args:
-            start: (N,3,3) rotations to start from; None for the sum of the turns between successive frames.
+            start: (N,3,3) rotations of another solution; None to start with the sum of the turns between
+                successive frames.
             with_translation: Also solve positions, in a room at distance 1 in all directions.
 
         Returns:
@@ -260,7 +267,7 @@ class _Problem:
         centres = np.zeros((len(rotations), 3))
         weights = np.ones(len(self.rays))
         residual_px = weights
-        for scale_px in _scales_px(_ITERATIONS):
+        for scale_px in _scales_px(_ITERATIONS) if start is None else [_LAST_SCALE_PX] * _REFINEMENTS:
             world = np.einsum("mij,mj->mi", rotations[self.frame], self.rays)
             seen_from = centres[self.frame]
             sums = self._per_point((world + seen_from) * weights[:, None])

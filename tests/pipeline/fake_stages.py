@@ -21,6 +21,7 @@ ORDERS = "BODYCAP_FAKE_ORDERS"
 "wanted" | "localised" | "contradicted": [a value per round], "lost": {camera: frames},
  "unused": {camera: reason}, "rolling": true, "late": number of maps,
  "unknown_clocks": [cameras], "corrected" | "corrected_before" | "distorted": [cameras] in refined maps,
+ "wrong": {"given" | "auto": frames that the video contradicts}, "tracks_show_lenses": true,
  "no_map": {"message", "hint"}, "unposed": true, "moves": true,
  "fail_rebuilt": true, "telemetry": [cameras], "stabilised": [cameras],
  "real": [stages that are no stand-ins]}.
@@ -192,9 +193,21 @@ def further_mapped(options: Json, arguments: Json, files: Path) -> None:
     (files / "summary.json").write_text(json.dumps({"further": orders().get("further", 0)}))
 
 
+def selected(options: Json, arguments: Json, files: Path) -> None:
+    """A camera with an unknown lens has the lens that its tracks determine, if they do."""
+    given = arguments["capture"]["config"]["cameras"][0]["calibration"] != "auto"
+    lens = not given and orders().get("tracks_show_lenses", True)
+    (files / "summary.json").write_text(json.dumps({"notes": ["a note"], "frames": 20, "lens": lens}))
+    (files / "calibration.json").write_text(json.dumps("given" if given else "auto"))
+
+
 def linked(options: Json, arguments: Json, files: Path) -> None:
+    """Of twenty frames, as many are wrong as the orders say for the lens of the camera."""
     posed = not orders().get("unposed", False)
-    values = {"links": [], "frame": "map", "posed": posed, "sigma": None, "extent": None}
+    lens = Path(arguments["keyframes"]["path"]) / "calibration.json"
+    wrong = orders().get("wrong", {}).get(json.loads(lens.read_text()), 0)
+    link = {"frame": "map", "compared": 20, "contradicted": wrong}
+    values = {"links": [link], "frame": "map", "posed": posed, "sigma": None, "extent": None}
     (files / "summary.json").write_text(json.dumps(values))
 
 
@@ -251,6 +264,7 @@ EXTRA = {
     "recover": recovered,
     "sound": heard,
     "further_maps": further_mapped,
+    "keyframes": selected,
     "links": linked,
     "rotations": turned,
     "merge": merged,

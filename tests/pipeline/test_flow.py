@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import EstimationError
@@ -177,3 +178,53 @@ def test_a_run_until_the_map_names_its_failure(bench: Bench) -> None:
         run_job(
             bench.job(skeleton="none"), out_dir=bench.out, settings=replace(bench.settings(), until="map")
         )
+
+
+LENS = {"model": "PINHOLE", "width": 64, "height": 48, "params": [50.0, 50.0, 32.0, 24.0]}
+GIVEN = {"left_palm": {"calibration": {**LENS, "pixel_origin": "COLMAP"}}}
+
+
+def lenses_of(bench: Bench, **changes: Any) -> tuple[Counter[str], str]:
+    """Run a job with a given lens of the left palm; return the stages, and the lens of the results."""
+    ran = stages_of(bench, **GIVEN, **changes)
+    job = yaml.safe_load((bench.out / "job.yaml").read_text(encoding="utf-8"))
+    cameras = {camera["name"]: camera["calibration"] for camera in job["capture"]["cameras"]}
+    assert cameras["torso"] == "auto"
+    return ran, "auto" if cameras["left_palm"] == "auto" else "given"
+
+
+@pytest.mark.parametrize("skeleton", ["upper_body", "none"])
+def test_a_given_lens_that_the_video_contradicts_gives_way_to_one_that_it_confirms(
+    bench: Bench, skeleton: str
+) -> None:
+    bench.order(wrong={"given": 4})
+    ran, lens = lenses_of(bench, skeleton=skeleton)
+    assert lens == "auto"
+    assert ran["map"] == 2
+    assert ran["keyframes"] == 2 * len(CAMERAS)
+    notes = [event.what for event in bench.events if event.kind == "note"]
+    assert [note for note in notes if "the given lens" in note and "left_palm" in note]
+
+
+def test_a_given_lens_stays_if_the_path_is_confirmed(bench: Bench) -> None:
+    bench.order(wrong={"given": 1, "auto": 0})
+    ran, lens = lenses_of(bench)
+    assert (ran["map"], lens) == (1, "given")
+
+
+@pytest.mark.parametrize("wrong", [{"given": 4, "auto": 4}, {"given": 4, "auto": 9}])
+def test_a_given_lens_stays_if_none_is_better(bench: Bench, wrong: dict[str, int]) -> None:
+    bench.order(wrong=wrong)
+    ran, lens = lenses_of(bench)
+    assert (ran["map"], lens) == (2, "given")
+
+
+def test_a_given_lens_stays_if_the_tracks_show_none(bench: Bench) -> None:
+    bench.order(wrong={"given": 4}, tracks_show_lenses=False)
+    ran, lens = lenses_of(bench)
+    assert (ran["map"], lens) == (1, "given")
+
+
+def test_unknown_lenses_are_not_freed(bench: Bench) -> None:
+    bench.order(wrong={"auto": 9})
+    assert stages_of(bench, skeleton="none")["map"] == 1
