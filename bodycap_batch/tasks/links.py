@@ -43,7 +43,7 @@ def run_links(task: LinksTask, context: StageContext, files: Path) -> None:
     certainty = path_uncertainty(path)
     found = {
         "frame": path.gauge,
-        "posed": any(bool(each.localised.any()) for each in paths),
+        "posed": bool(path.localised.any()),
         "sigma": certainty["sigma"],
         "extent": certainty["extent"],
     }

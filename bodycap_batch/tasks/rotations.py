@@ -62,8 +62,8 @@ def confirmed_frames(links: Mapping[str, Mapping[str, Any]]) -> int:
 def without_positions(links: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return the names of the cameras whose positions say nothing.
 
-    They have no pose, or the video contradicts their path, or the positions are as uncertain as the path is
-    long.
+    Their path has no pose, the video contradicts it, or its positions are as uncertain as it is long. Poses
+    of further maps, whose place is unknown, do not count.
 
     Args:
         links: The summaries of the stage `links`, by camera name.
