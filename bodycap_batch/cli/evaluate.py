@@ -72,7 +72,7 @@ def evaluate(
 
     For camera paths, the command prints ATE, RPE and coverage. For a motion, the command prints the errors of
     the joints. The files of a camera are found by their name, and all cameras are aligned together. A frame
-    without a pose reduces the coverage.
+    without a pose reduces the coverage. Rotations without positions are turned by a rotation of their own.
 
     With --video, features that the job did not use are matched in frames that are 1, 5, 15 and 45 apart, and
     across lost frames. A frame is right if the matches join it to the largest set of frames whose relative

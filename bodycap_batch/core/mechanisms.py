@@ -56,7 +56,7 @@ class Mechanism(StrEnum):
     GAP_FILLING = "gap_filling"
     SENSOR_PATH = "sensor_path"
     FURTHER_MAPS = "further_maps"
-    MERE_TURN = "mere_turn"
+    PURE_ROTATION = "pure_rotation"
     FREED_LENSES = "freed_lenses"
     CONTINUITY = "continuity"
     MOUNT_SLIPS = "mount_slips"

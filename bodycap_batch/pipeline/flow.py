@@ -11,6 +11,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+from bodycap_batch.config.calibration import Calibration
 from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_MAPPED, LEAST_POSED
 from bodycap_batch.config.models import CameraConfig, CaptureConfig, Job
 from bodycap_batch.config.mounts import MOTION_PLACES, TRUNK_ROLES, mount_of
@@ -74,6 +75,9 @@ ByCamera = Mapping[str, Artefact]
 class Flow:
     """Runs the stages of one job; a context manager that waits for its threads at the end.
 
+    Attributes:
+        freed: By name of each camera whose given lens is not used, its given focal length over the width.
+
     Args:
         job: A resolved job.
         settings: Settings of the run: store, threads, listener, cancellation.
@@ -90,7 +94,7 @@ class Flow:
         self._cameras: dict[str, str] = {}
         self._map_round = 0
         self._map_failure: EstimationError | None = None
-        self.freed: tuple[str, ...] = ()
+        self.freed: Mapping[str, float] = {}
         self._with_telemetry = frozenset[str]()
         self._with_gyro = frozenset[str]()
         self._stabilised = frozenset[str]()
@@ -476,21 +480,23 @@ class Flow:
         Returns:
             None if no path of a camera with a given lens is contradicted.
         """
-        given = self._job.capture.calibration
-        suspects = {
-            camera.name
+        given = {
+            camera.name: camera.calibration.camera()
             for camera in self._job.capture.cameras
-            if (camera.calibration if camera.calibration is not None else given) not in (None, "auto")
+            if isinstance(camera.calibration, Calibration)
             and contradicted_share(read_summary(links[camera.name].path)) > MAX_CONTRADICTED
         }
-        if not suspects or not is_on(Mechanism.FREED_LENSES):
+        if not given or not is_on(Mechanism.FREED_LENSES):
             return None
-        out = copy.copy(self)
-        out.freed = tuple(sorted(suspects))
-        out._job, out._capture = (
-            self._job.model_copy(update={"capture": _with_unknown_lenses(self._job.capture, suspects)}),
-            _with_unknown_lenses(self._capture, suspects),
+        self.runner.note(
+            f"{', '.join(given)}: the video contradicts the path with the given lens, so the paths are "
+            "computed once more with an unknown lens",
+            "map",
         )
+        out = copy.copy(self)
+        out.freed = {name: lens.focal_px / lens.width_px for name, lens in given.items()}
+        out._job = self._job.model_copy(update={"capture": _with_unknown_lenses(self._job.capture, given)})
+        out._capture = _with_unknown_lenses(self._capture, given)
         out._map_round, out._map_failure = 0, None
         out.identify_videos()
         return out
@@ -539,7 +545,7 @@ class Flow:
     @property
     def _may_be_rotations(self) -> bool:
         """True if the job can have rotations without positions as its result."""
-        return not has_body(self._job) and is_on(Mechanism.MERE_TURN)
+        return not has_body(self._job) and is_on(Mechanism.PURE_ROTATION)
 
     def merge(
         self, scene_map: Artefact, registrations: ByCamera, clocks: Artefact, keyframes: ByCamera
@@ -590,6 +596,7 @@ class Flow:
             links=refs_by_camera(results.links),
             merge=optional_ref(results.filled),
             failure=None if results.failure is None else results.failure.message,
+            freed=self.freed,
             segments=tuple(tuple(camera.name for camera in cameras) for cameras in capture.segments()),
         )
         artefact = self.runner.run(make_task(EXPORT, task, threads=self._threads))

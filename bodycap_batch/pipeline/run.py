@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import yaml
@@ -198,14 +198,15 @@ def _with_better_lenses(flow: Flow, results: StageResults) -> Flow:
     )
     is_right = all(contradicted_share(after[name]) <= MAX_CONTRADICTED for name in other.freed)
     if not is_right or confirmed_frames(after) <= confirmed_frames(before):
+        flow.runner.note(
+            f"{names}: the video does not confirm more without the given lens, so it stays", "map"
+        )
         return flow
     flow.runner.note(
-        f"{names}: the video contradicts the path with the given lens and confirms one with a lens that is "
-        "estimated from the video; this one is used",
-        "map",
+        f"{names}: the video confirms the path with the lens that it shows, so this lens is used", "map"
     )
-    for name in ("keyframes", "map", "registrations", "links", "clocks", "job", "failure"):
-        setattr(results, name, getattr(found, name))
+    for each in fields(found):
+        setattr(results, each.name, getattr(found, each.name))
     return other
 
 

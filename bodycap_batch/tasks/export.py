@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.context import StageContext
@@ -18,6 +18,7 @@ from bodycap_batch.tasks.typed_json import omitted_from_key
 
 if TYPE_CHECKING:
     from bodycap_batch.export.export_inputs import VideoFacts
+    from bodycap_batch.model.scene import MapResult
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,6 +37,7 @@ class ExportTask:
         links: What the tracks of each camera's video show about its paths, by camera name.
         merge: The skeleton's motion; None if there is no motion.
         failure: The reason why the skeleton that the job asks for is missing; None if no skeleton is missing.
+        freed: By name of each camera whose given lens is not used, its given focal length over the width.
         segments: For each body segment with several cameras, the names of these cameras.
     """
 
@@ -49,6 +51,7 @@ class ExportTask:
     links: Mapping[str, ArtefactRef]
     merge: ArtefactRef | None
     failure: str | None
+    freed: Mapping[str, float]
     segments: tuple[tuple[str, ...], ...]
 
 
@@ -79,7 +82,7 @@ def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
         take=task.take,
         videos=_video_facts(task.capture),
         log={
-            **scene.log,
+            **log_of(scene, task.freed),
             "reach": read_summary(task.clocks.path)["distances"],
             "links": {name: read_summary(each.path)["links"] for name, each in task.links.items()},
         },
@@ -87,6 +90,24 @@ def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
     export_results(inputs, task.options, context)
     metrics = json.loads((inputs.out_dir / "metrics.json").read_text(encoding="utf-8"))
     write_summary(files, notes=metrics[LEFT_OUT])
+
+
+def log_of(scene: MapResult, freed: Mapping[str, float]) -> Mapping[str, Any]:
+    """Return the log of the maps, with how each lens differs from a given one that is not used."""
+    found = {name: lens for each in reversed(scene.maps) for name, lens in each.cameras.items()}
+    factors = {
+        name: round(found[name].focal_px / found[name].width_px / given, 3)
+        for name, given in freed.items()
+        if name in found
+    }
+    if not factors:
+        return scene.log
+    before = scene.diagnostics
+    return replace(
+        before,
+        misfit_factors={**(before.misfit_factors or {}), **factors},
+        recalibrated=(*before.recalibrated, *factors),
+    ).to_log()
 
 
 def _video_facts(capture: CaptureRef) -> dict[str, VideoFacts]:

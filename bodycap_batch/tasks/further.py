@@ -11,7 +11,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.mapping import MAP_MEMORY_MB, save_map
-from bodycap_batch.tasks.registered_cameras import INERTIAL_CAMERA, OTHER_PATHS
+from bodycap_batch.tasks.registered_cameras import OTHER_PATHS, keep_sensor
 from bodycap_batch.tasks.registration import NOT_ROUNDS, save_registration
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, read_summary
 
@@ -70,8 +70,7 @@ def run_further_maps(task: FurtherMapsTask, context: StageContext, files: Path) 
 
 def run_further_poses(task: FurtherPosesTask, context: StageContext, files: Path) -> None:
     """Store the camera's registration, and the poses of its lost frames in further maps."""
-    from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
-    from bodycap_batch.model.inertial_camera import InertialCamera
+    from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.registration import localise_in_other_maps
 
     camera = load_capture(task.capture, task.keyframes, threads=context.threads).cameras[0]
@@ -82,8 +81,7 @@ def run_further_poses(task: FurtherPosesTask, context: StageContext, files: Path
     )
     save_registration(found, camera, files, rolling=read_summary(before)["rolling"])
     write_dataclass(paths, files, OTHER_PATHS)
-    if (before / f"{INERTIAL_CAMERA}.json").exists():
-        write_dataclass(read_dataclass(InertialCamera, before, INERTIAL_CAMERA), files, INERTIAL_CAMERA)
+    keep_sensor(before, files)
 
 
 FURTHER_MAPS = Stage(

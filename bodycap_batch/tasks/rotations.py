@@ -11,7 +11,7 @@ from bodycap_batch.config.path_bounds import MAX_CONTRADICTED, MAX_UNCERTAINTY
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
-from bodycap_batch.tasks.registered_cameras import INERTIAL_CAMERA
+from bodycap_batch.tasks.registered_cameras import keep_sensor
 from bodycap_batch.tasks.registration import save_registration
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, read_summary
 
@@ -84,9 +84,7 @@ def run_rotations(task: RotationsTask, context: StageContext, files: Path) -> No
     from dataclasses import replace
 
     from bodycap_batch.core.mechanisms import Mechanism, record_act
-    from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
-    from bodycap_batch.model.inertial_camera import InertialCamera
-    from bodycap_batch.tracks import measure_mere_turn, rotations_alone, track_video
+    from bodycap_batch.tracks import measure_pure_rotation, rotations_alone, track_video
 
     camera = load_capture(task.capture, task.keyframes, threads=context.threads).cameras[0]
     selection = load_keyframes(task.keyframes[camera.name].path)
@@ -102,17 +100,15 @@ def run_rotations(task: RotationsTask, context: StageContext, files: Path) -> No
     if len(selection.moving_regions):
         tracks = tracks.outside(selection.moving_regions)
     context.progress(0, 0, "measuring how the camera turns")
-    lens, lens_sigma = _lens(camera.camera, selection)
-    turn = measure_mere_turn(tracks, lens.scaled(tracks.width_px, tracks.height_px), lens_sigma)
-    record_act(Mechanism.MERE_TURN, int(turn is not None))
+    lens, lens_sigma = lens_for_rotations(camera.camera, selection)
+    turn = measure_pure_rotation(tracks, lens.scaled(tracks.width_px, tracks.height_px), lens_sigma)
+    record_act(Mechanism.PURE_ROTATION, int(turn is not None))
     found = before
     if turn is not None:
         found = replace(before, trajectory=rotations_alone(before.trajectory, turn, scene))
     rolling = bool(read_summary(task.registration.path)["rolling"])
     save_registration(found, camera, files, rolling=rolling)
-    if (task.registration.path / f"{INERTIAL_CAMERA}.json").exists():
-        sensor = read_dataclass(InertialCamera, task.registration.path, INERTIAL_CAMERA)
-        write_dataclass(sensor, files, INERTIAL_CAMERA)
+    keep_sensor(task.registration.path, files)
 
 
 def _map_of(path: Path, trajectory: Trajectory) -> Map | None:
@@ -121,7 +117,7 @@ def _map_of(path: Path, trajectory: Trajectory) -> Map | None:
     return next((each for each in maps if each.gauge == trajectory.gauge or not each.keyframe_camera), None)
 
 
-def _lens(start: Camera, selection: KeyframeSelection) -> tuple[Camera, float]:
+def lens_for_rotations(start: Camera, selection: KeyframeSelection) -> tuple[Camera, float]:
     """Return the lens of the camera and the relative sigma of its focal length."""
     if not start.refine:
         return start, 0.0

@@ -203,7 +203,9 @@ def test_a_given_lens_that_the_video_contradicts_gives_way_to_one_that_it_confir
     assert ran["map"] == 2
     assert ran["keyframes"] == 2 * len(CAMERAS)
     notes = [event.what for event in bench.events if event.kind == "note"]
-    assert [note for note in notes if "the given lens" in note and "left_palm" in note]
+    assert sum("left_palm" in note and "lens" in note for note in notes) == 2, (
+        "before and after the second time"
+    )
 
 
 def test_a_given_lens_stays_if_the_path_is_confirmed(bench: Bench) -> None:
@@ -228,3 +230,14 @@ def test_a_given_lens_stays_if_the_tracks_show_none(bench: Bench) -> None:
 def test_unknown_lenses_are_not_freed(bench: Bench) -> None:
     bench.order(wrong={"auto": 9})
     assert stages_of(bench, skeleton="none")["map"] == 1
+
+
+def test_the_files_state_the_lens_that_was_given(bench: Bench) -> None:
+    bench.order(wrong={"given": 4})
+    children = Watched()
+    run_job(
+        bench.job(**GIVEN, skeleton="none"),
+        out_dir=bench.out,
+        settings=replace(bench.settings(), executor=children),
+    )
+    assert children.arguments["export"]["freed"] == {"left_palm": pytest.approx(50.0 / 64.0)}

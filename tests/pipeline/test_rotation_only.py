@@ -112,7 +112,7 @@ def test_without_a_map_the_pictures_have_no_lens(turned: Path, capsys: pytest.Ca
     assert "rotations without a map" in capsys.readouterr().err
 
 
-def test_a_camera_that_moves_without_a_map_keeps_the_reason_of_the_map(
+def test_a_film_of_noise_has_neither_a_map_nor_rotations(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Each frame shows another picture of noise, so nothing can be followed."""

@@ -46,6 +46,15 @@ difference that the third pose's second difference cancels. The first pose may b
 below _FIRST_MAX_RESPONSE. The second pose may be wrong if the response is between _SECOND_MIN_RESPONSE and
 _SECOND_MAX_RESPONSE. Origin: the response is 0 if the first pose is wrong, 0.5 if the second pose is wrong,
 and 2 if the third pose is wrong. Evidence for the thresholds between these values: none."""
+_MIN_SIDE_RESPONSE = 0.125
+"""Minimum fraction of a single outlier's second difference that each neighbour cancels. It is 0.5 at a single
+outlier. At a step of the path, it is 1 on one side and 0 on the other. Origin: a quarter of 0.5."""
+_STEP_MIN_RESPONSE, _STEP_MAX_RESPONSE = 0.75, 1.5
+"""Response (as after a lost interval) at which all poses between the lost interval and a step are
+wrong. Origin: it is 0.5 if the second pose is wrong, 1 at a step, 2 if the third pose is wrong."""
+_STEP_LENGTHS = (2, 3)
+"""Numbers of poses between a lost interval and a step, as for runs. Evidence:
+docs/decisions/registration.md."""
 _SCALE_WINDOW = 12
 """Number of frames on either side that determine the typical second difference. Evidence: none."""
 ISOLATED_INLIER_FACTOR = 4
@@ -101,7 +110,8 @@ def _single_outliers(centres: FloatArray, sigma: FloatArray, times_ns: IntArray)
     frames = 1 + _run_starts(np.isfinite(size), 3)
     highest = np.maximum(size[frames - 1], size[frames + 1])
     frames = frames[(size[frames] > _MIN_SIGMAS * noise[frames]) & (size[frames] >= highest)]
-    response = -np.sum((offset[frames - 1] + offset[frames + 1]) * offset[frames], axis=1)
+    sides = -np.stack([np.sum(offset[frames + side] * offset[frames], axis=1) for side in (-1, 1)])
+    response = np.where((sides >= _MIN_SIDE_RESPONSE * size[frames] ** 2).all(axis=0), sides.sum(axis=0), 0.0)
     is_slow = times_ns[frames + 1] - times_ns[frames - 1] > _SLOW_SPAN_NS
     min_response = np.where(is_slow, _MIN_NEIGHBOUR_RESPONSE_SLOW, _MIN_NEIGHBOUR_RESPONSE)
     for frame in frames[response >= min_response * size[frames] ** 2].tolist():
@@ -186,6 +196,9 @@ def _outliers_after_gaps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
     difference of the third pose changes by half of this deviation, with the opposite sign. If the response
     does not distinguish a wrong first pose from a wrong second pose, both poses are rejected.
 
+    If the first two or three poses are wrong and agree with each other, the path makes a step after them: its
+    second differences before and after the step cancel each other. The few poses are rejected.
+
     If the third pose is wrong, its own second difference changes twice as much as the second difference of
     the second pose. The third pose is not tested here, because it has both neighbours: `_single_outliers`
     tests it.
@@ -203,7 +216,27 @@ def _outliers_after_gaps(centres: FloatArray, sigma: FloatArray) -> BoolArray:
             response = -offset[third] @ offset[second] / size[second] ** 2
             out[first] |= response < _FIRST_MAX_RESPONSE
             out[second] |= _SECOND_MIN_RESPONSE < response <= _SECOND_MAX_RESPONSE
+        for last in (first + length - 1 for length in _STEP_LENGTHS):
+            if _is_step(offset, noise, last):
+                out[first : last + 1] = True
     return out
+
+
+def _is_step(offset: FloatArray, noise: FloatArray, last: int) -> bool:
+    """Return whether the path makes a step from a pose to the next one: both sides of it are smooth.
+
+    Args:
+        offset: (N,3) second differences.
+        noise: (N,) their standard deviations.
+        last: Frame before the step.
+    """
+    nearby = np.linalg.norm(offset[last + 2 : last + 2 + _SCALE_WINDOW], axis=1)
+    if not np.isfinite(offset[last : last + 2]).all() or np.isfinite(nearby).sum() < _SCALE_WINDOW // 2:
+        return False
+    size = float(np.linalg.norm(offset[last]))
+    response = -float(offset[last + 1] @ offset[last]) / size**2
+    is_large = size > max(_GAP_MIN_SIGMAS * noise[last], _GAP_MIN_SCALE_RATIO * np.nanmedian(nearby))
+    return bool(is_large and _STEP_MIN_RESPONSE < response <= _STEP_MAX_RESPONSE)
 
 
 def isolated_poses(localised: BoolArray, inliers: IntArray, min_inliers: int) -> BoolArray:

@@ -44,10 +44,13 @@ def test_the_features_of_each_keyframe_are_counted(tmp_path: Path) -> None:
 def test_a_map_must_contain_a_tenth_of_the_keyframes_with_texture(
     registered: int, textured: int, is_refused: bool
 ) -> None:
-    error = check_coverage([_model(registered)], 150, textured, [], MapOptions())
+    tried = [{"pair": ["a", "b"], "doubt": "the two cameras are too close"}, {"failed": "other"}]
+    error = check_coverage([_model(registered)], 150, textured, tried, MapOptions())
     assert (error is not None) == is_refused
     if error is not None:
         assert f"{registered} of 150 keyframes, {textured} of which show texture" in str(error)
+        assert "to start from, the two cameras are too close" in str(error)
+        assert "other" not in str(error)
 
 
 def test_no_model_is_refused_even_if_no_keyframe_has_texture() -> None:

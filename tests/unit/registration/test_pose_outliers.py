@@ -125,6 +125,26 @@ def test_a_wrong_pose_next_to_a_lost_interval_is_distinguished_from_its_neighbou
     assert np.flatnonzero(find_outlier_poses(centres, SIGMA, TIMES_NS)).tolist() == [frame]
 
 
+@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("length", [1, 2, 3])
+def test_a_few_poses_between_a_lost_interval_and_a_step_are_wrong(*, length: int, backwards: bool) -> None:
+    """They agree with each other. Without the first right pose, nothing contradicts them."""
+    centres = _swing(1.0) + np.random.default_rng(4).normal(0, 0.004, (60, 3))
+    centres[20:30] = np.nan
+    centres[30 : 30 + length] += [0.0, 0.8, -0.4]
+    wrong = list(range(30, 30 + length))
+    if backwards:
+        centres, wrong = centres[::-1].copy(), [59 - frame for frame in reversed(wrong)]
+    assert np.flatnonzero(find_outlier_poses(centres, SIGMA, TIMES_NS)).tolist() == wrong
+
+
+def test_a_step_far_from_lost_frames_is_no_single_outlier() -> None:
+    """Which side is wrong is not known here."""
+    centres = _swing(1.0) + np.random.default_rng(4).normal(0, 0.004, (60, 3))
+    centres[30:] += [0.0, 0.8, -0.4]
+    assert not find_outlier_poses(centres, SIGMA, TIMES_NS).any()
+
+
 @pytest.mark.parametrize(
     ("seen", "refused"),
     [

@@ -15,6 +15,7 @@ import pytest
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import CaptureError, DiskAway, JobError
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.lens_estimate import LensEstimate
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.nominal_mounts import (
     NOMINAL_SIGMA_RAD,
@@ -23,14 +24,16 @@ from bodycap_batch.model.nominal_mounts import (
     nominal_mount,
 )
 from bodycap_batch.model.rolling_shutter import mean_row_fraction
-from bodycap_batch.model.scene import FrameStatus, Registration, Trajectory
+from bodycap_batch.model.scene import FrameStatus, MapResult, Registration, Trajectory
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.model.skeleton_presets import load_skeleton
 from bodycap_batch.pipeline.inputs import body_input, camera_digest
 from bodycap_batch.store.digests import FileDigests
 from bodycap_batch.tasks.body import mount_prior
+from bodycap_batch.tasks.export import log_of
 from bodycap_batch.tasks.registration import may_have_rolling_shutter
-from bodycap_batch.tasks.rotations import without_positions
+from bodycap_batch.tasks.rotations import lens_for_rotations, without_positions
+from tests.scenes import small_map
 
 QUARTER_TURN = {"translation_m": [0.1, 0.2, 0.3], "quat_xyzw": [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]}
 
@@ -200,3 +203,26 @@ def test_positions_that_say_nothing_are_found_by_the_links_and_the_sigma() -> No
         "other": camera(frame="c", posed=True, sigma=None, extent=None),
     }
     assert without_positions(found) == ["noise", "unposed", "wrong"]
+
+
+def test_rotations_use_the_lens_that_is_known_best() -> None:
+    start = Camera(model="PINHOLE", width_px=64, height_px=48, params=np.array([50.0, 50.0, 32.0, 24.0]))
+    unknown = replace(start, refine=True)
+    selection: Any = SimpleNamespace(lens=None)
+    assert lens_for_rotations(start, selection) == (start, 0.0)
+    guess, sigma = lens_for_rotations(unknown, selection)
+    assert guess is unknown
+    assert sigma > 0.1
+    found = LensEstimate(lens=start, focal_sigma=0.04, pairs=20, error_px=0.3)
+    assert lens_for_rotations(unknown, SimpleNamespace(lens=found)) == (start, 0.04)  # type: ignore[arg-type]
+
+
+def test_the_results_state_a_given_lens_that_is_not_used() -> None:
+    scene = MapResult(maps=(small_map(),), workspace=Path("w"), log={"keyframes": 4})
+    name, lens = next(iter(scene.maps[0].cameras.items()))
+    given = lens.focal_px / lens.width_px / 1.04
+    assert log_of(scene, {}) is scene.log
+    diagnostics = MapDiagnostics.from_log(log_of(scene, {name: given, "unmapped": 0.5}))
+    assert diagnostics.misfit_factors == {name: 1.04}
+    assert diagnostics.recalibrated == (name,)
+    assert diagnostics.details["keyframes"] == 4

@@ -162,6 +162,7 @@ def tasks(folder: Path) -> dict[str, Any]:
             links=stored,
             merge=None,
             failure="too few frames",
+            freed={"torso": 0.6},
             segments=(("torso", "head"),),
         ),
         "report": ReportTask(

@@ -74,7 +74,7 @@ _CHUNK = 1 << 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MereTurn:
+class PureRotation:
     """The rotations of a camera that hardly moves.
 
     Attributes:
@@ -96,7 +96,7 @@ class MereTurn:
         return np.asarray(np.isfinite(self.first_from_cam).all(axis=(1, 2)))
 
 
-def measure_mere_turn(tracks: PointTracks, lens: Camera, lens_sigma: float = 0.0) -> MereTurn | None:
+def measure_pure_rotation(tracks: PointTracks, lens: Camera, lens_sigma: float = 0.0) -> PureRotation | None:
     """Measure the rotations of a camera that hardly moves.
 
     Args:
@@ -105,8 +105,8 @@ def measure_mere_turn(tracks: PointTracks, lens: Camera, lens_sigma: float = 0.0
         lens_sigma: Relative standard deviation of the focal length.
 
     Returns:
-        None if a mere turn does not explain what most of the video shows: the camera moves. None, too, if the
-        rotations are too uncertain.
+        None if a pure rotation does not explain what most of the video shows: the camera moves. None, too, if
+        the rotations are too uncertain.
     """
     problem = _Problem.create(tracks, lens)
     usable = np.flatnonzero(problem.counts >= _MIN_POINTS)
@@ -141,11 +141,13 @@ def measure_mere_turn(tracks: PointTracks, lens: Camera, lens_sigma: float = 0.0
         return None
     first = turn[np.argmax(shown)]
     rotations = np.where(shown[:, None, None], first.T @ turn, np.nan)
-    return MereTurn(first_from_cam=rotations, sigma_rad=np.where(shown, sigma_rad, np.nan))
+    return PureRotation(first_from_cam=rotations, sigma_rad=np.where(shown, sigma_rad, np.nan))
 
 
-def rotations_alone(path: Trajectory, turn: MereTurn, scene: Map | None) -> Trajectory:
+def rotations_alone(path: Trajectory, turn: PureRotation, scene: Map | None) -> Trajectory:
     """Return a path with the rotations of a camera that hardly moves, and without positions.
+
+    A damaged or frozen frame stays one: its picture is not of its time.
 
     Args:
         path: The path, with positions that say nothing or without any.
@@ -153,6 +155,8 @@ def rotations_alone(path: Trajectory, turn: MereTurn, scene: Map | None) -> Traj
         scene: The map of the path, in whose axes the rotations are given as far as its keyframes show them.
             An empty map has the axes of the first measured frame. None if no map contains the camera.
     """
+    no_picture = (FrameStatus.DAMAGED, FrameStatus.FROZEN)
+    shown = turn.measured & np.array([each not in no_picture for each in path.status], dtype=bool)
     known = path.gauge_from_cam[:, :3, :3].copy()
     if scene is not None and not path.localised.any():
         own = scene.keyframes_of(path.camera)
@@ -161,11 +165,11 @@ def rotations_alone(path: Trajectory, turn: MereTurn, scene: Map | None) -> Traj
     sums = np.sum(known[both] @ np.swapaxes(turn.first_from_cam[both], 1, 2), axis=0)
     gauge_from_first = nearest_rotation(sums) if both.any() else np.eye(3)
     poses = np.full((len(path.status), 4, 4), np.nan)
-    poses[turn.measured] = np.eye(4)
-    poses[turn.measured, :3, 3] = np.nan
-    poses[turn.measured, :3, :3] = gauge_from_first @ turn.first_from_cam[turn.measured]
+    poses[shown] = np.eye(4)
+    poses[shown, :3, 3] = np.nan
+    poses[shown, :3, :3] = gauge_from_first @ turn.first_from_cam[shown]
     covariance = np.full((len(poses), 6, 6), np.nan)
-    covariance[turn.measured, :3, :3] = turn.sigma_rad[turn.measured, None, None] ** 2 * np.eye(3)
+    covariance[shown, :3, :3] = turn.sigma_rad[shown, None, None] ** 2 * np.eye(3)
     had_position = path.localised | np.array([each is FrameStatus.OTHER_MAP for each in path.status])
     lost = np.where(had_position, FrameStatus.UNCONSTRAINED, path.status)
     return replace(
@@ -173,7 +177,7 @@ def rotations_alone(path: Trajectory, turn: MereTurn, scene: Map | None) -> Traj
         gauge=path.gauge if scene is None else scene.gauge,
         gauge_from_cam=poses,
         covariance=covariance,
-        status=tuple(map(FrameStatus, np.where(turn.measured, FrameStatus.ROTATION_ONLY, lost))),
+        status=tuple(map(FrameStatus, np.where(shown, FrameStatus.ROTATION_ONLY, lost))),
         inliers=np.zeros_like(path.inliers),
         error_px=np.full_like(path.error_px, np.nan),
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,8 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import nearest_rotation, rotation_angle_rad, so3_exp
 from bodycap_batch.model.point_tracks import PointTracks
-from bodycap_batch.model.scene import FrameStatus, Trajectory
-from bodycap_batch.tracks import measure_mere_turn, rotations_alone
+from bodycap_batch.model.scene import FrameStatus, Map, Trajectory
+from bodycap_batch.tracks import measure_pure_rotation, pure_rotation, rotations_alone
 from tests.scenes import small_map
 from tests.unit.tracks.simulated import project, tracks_of_views
 
@@ -49,7 +51,7 @@ def errors_deg(found: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize("hand_m", [0.0, 0.15])
 def test_the_rotations_of_a_camera_that_only_turns_are_exact(hand_m: float) -> None:
-    found = measure_mere_turn(tracks(0.0, hand_m), LENS)
+    found = measure_pure_rotation(tracks(0.0, hand_m), LENS)
     assert found is not None
     assert found.measured.all()
     errors = errors_deg(found.first_from_cam)
@@ -59,7 +61,7 @@ def test_the_rotations_of_a_camera_that_only_turns_are_exact(hand_m: float) -> N
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_small_motion_is_part_of_the_sigma(seed: int) -> None:
-    found = measure_mere_turn(tracks(0.01, 0.15, seed), LENS)
+    found = measure_pure_rotation(tracks(0.01, 0.15, seed), LENS)
     assert found is not None
     errors = errors_deg(found.first_from_cam)
     assert 0.1 < errors.max() < 0.6  # 1 cm in 1 m is 0.6 degrees
@@ -68,36 +70,31 @@ def test_a_small_motion_is_part_of_the_sigma(seed: int) -> None:
     assert np.degrees(found.sigma_rad).max() < 1.0
 
 
-def test_a_camera_that_moves_has_no_mere_turn() -> None:
-    assert measure_mere_turn(tracks(0.5), LENS) is None
+def test_a_camera_that_moves_has_no_pure_rotation() -> None:
+    assert measure_pure_rotation(tracks(0.5), LENS) is None
 
 
 def test_an_uncertain_lens_makes_the_angles_uncertain() -> None:
-    exact, uncertain = (measure_mere_turn(tracks(0.0), LENS, sigma) for sigma in (0.0, 0.2))
+    exact, uncertain = (measure_pure_rotation(tracks(0.0), LENS, sigma) for sigma in (0.0, 0.2))
     assert exact is not None
     assert uncertain is not None
     assert uncertain.sigma_rad.max() > 1.5 * exact.sigma_rad.max()
-    assert measure_mere_turn(tracks(0.0), LENS, 5.0) is None
+    assert measure_pure_rotation(tracks(0.0), LENS, 5.0) is None
 
 
 def test_frames_without_points_have_no_rotation() -> None:
     seen = tracks(0.0)
     dark = seen.outside((np.arange(FRAMES) == 7)[:, None, None])
-    found = measure_mere_turn(dark, LENS)
+    found = measure_pure_rotation(dark, LENS)
     assert found is not None
     assert np.flatnonzero(~found.measured).tolist() == [7]
-    assert measure_mere_turn(seen.outside(np.ones((1, 1), dtype=bool)), LENS) is None
+    assert measure_pure_rotation(seen.outside(np.ones((1, 1), dtype=bool)), LENS) is None
 
 
-def test_a_path_of_rotations_alone_has_the_axes_of_its_map() -> None:
-    found = measure_mere_turn(tracks(0.0), LENS)
-    assert found is not None
-    status = [FrameStatus.FEW_TRACKS] * FRAMES
-    scene = small_map()
-    camera = scene.keyframe_camera[0]
-    own = scene.keyframes_of(camera)
-    path = Trajectory(
-        camera=camera,
+def path_of(scene: Map, status: Sequence[FrameStatus]) -> Trajectory:
+    """Return a path without poses of the camera of a map's first keyframe."""
+    return Trajectory(
+        camera=scene.keyframe_camera[0],
         gauge=scene.gauge,
         frame_numbers=np.arange(FRAMES),
         times_ns=(TIME_S * 1e9).astype(np.int64),
@@ -107,6 +104,14 @@ def test_a_path_of_rotations_alone_has_the_axes_of_its_map() -> None:
         inliers=np.zeros(FRAMES, dtype=np.int64),
         error_px=np.full(FRAMES, np.nan),
     )
+
+
+def test_a_path_of_rotations_alone_has_the_axes_of_its_map() -> None:
+    found = measure_pure_rotation(tracks(0.0), LENS)
+    assert found is not None
+    scene = small_map()
+    path = path_of(scene, [FrameStatus.FEW_TRACKS] * FRAMES)
+    own = scene.keyframes_of(path.camera)
     turned = rotations_alone(path, found, scene)
     assert set(turned.status) == {FrameStatus.ROTATION_ONLY}
     assert not turned.localised.any()
@@ -122,6 +127,28 @@ def test_a_path_of_rotations_alone_has_the_axes_of_its_map() -> None:
     between = np.swapaxes(turned.gauge_from_cam[:-1, :3, :3], 1, 2) @ turned.gauge_from_cam[1:, :3, :3]
     expected = np.swapaxes(found.first_from_cam[:-1], 1, 2) @ found.first_from_cam[1:]
     assert np.allclose(between, expected)
+
+
+def test_a_picture_that_is_not_of_its_time_gives_no_rotation() -> None:
+    turn = measure_pure_rotation(tracks(0.0).outside((np.arange(FRAMES) == 9)[:, None, None]), LENS)
+    assert turn is not None
+    status = [FrameStatus.FEW_TRACKS] * FRAMES
+    status[3], status[5], status[9] = FrameStatus.DAMAGED, FrameStatus.FROZEN, FrameStatus.OTHER_MAP
+    turned = rotations_alone(path_of(small_map(), status), turn, small_map())
+    assert (turned.status[3], turned.status[5]) == (FrameStatus.DAMAGED, FrameStatus.FROZEN)
+    # The pose in a further map is withdrawn with the others of the camera.
+    assert turned.status[9] is FrameStatus.UNCONSTRAINED
+    assert turned.rotation_only.sum() == FRAMES - 3
+    assert np.isnan(turned.gauge_from_cam[~turned.rotation_only]).all()
+
+
+def test_a_part_of_many_tracks_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = tracks(0.0)
+    monkeypatch.setattr(pure_rotation, "_MAX_OBSERVATIONS", len(seen.track) // 3)
+    found = measure_pure_rotation(seen, LENS)
+    assert found is not None
+    assert found.measured.all()
+    assert 0.0 < errors_deg(found.first_from_cam).max() < 0.1
 
 
 def test_a_path_that_claims_a_rotation_must_have_one() -> None:
