@@ -44,7 +44,7 @@ class FrameStatus(StrEnum):
     POSE_JUMP: Lost; the estimated pose was rejected as an outlier of the trajectory.
     UNCONFIRMED: Lost; few observations support the estimated pose, and no neighbouring frame confirms it.
     CONTRADICTED: Lost; the pose was withdrawn, because the keyframes around the frame contradict the map, or
-        because the tracks of the video contradict the rotation of the pose.
+        because the tracks of the video contradict the pose.
     NO_MAP: Lost; no map contains this camera.
     OTHER_MAP: Lost in the camera's map; localised in another map, whose place in the camera's map is unknown.
     DAMAGED: Lost; the frame cannot be decoded, or the decoder reports that its data are damaged.

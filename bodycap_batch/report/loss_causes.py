@@ -107,7 +107,7 @@ CAUSES = {
         "and walk past each place more than once.",
     ),
     LossCause.CONTRADICTED: (
-        "keyframes near it contradict the rest of the map, or the video does not turn as the pose does",
+        "keyframes near it contradict the rest of the map, or the video does not move as the pose does",
         _WALLS,
     ),
     LossCause.NO_MAP: (

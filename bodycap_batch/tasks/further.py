@@ -11,9 +11,9 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.mapping import MAP_MEMORY_MB, save_map
-from bodycap_batch.tasks.registered_cameras import OTHER_PATHS, keep_sensor
-from bodycap_batch.tasks.registration import NOT_ROUNDS, save_registration
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, read_summary
+from bodycap_batch.tasks.registered_cameras import OTHER_PATHS
+from bodycap_batch.tasks.registration import NOT_ROUNDS, replace_registration
+from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,9 +79,8 @@ def run_further_poses(task: FurtherPosesTask, context: StageContext, files: Path
     found, paths = localise_in_other_maps(
         load_registration(before), camera, load_map(task.map.path).maps, selection, task.options, context
     )
-    save_registration(found, camera, files, rolling=read_summary(before)["rolling"])
+    replace_registration(found, before, files)
     write_dataclass(paths, files, OTHER_PATHS)
-    keep_sensor(before, files)
 
 
 FURTHER_MAPS = Stage(

@@ -9,12 +9,13 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef
 from bodycap_batch.tasks.loading import TRACKS, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.registered_cameras import OTHER_PATHS
+from bodycap_batch.tasks.registration import replace_registration
 from bodycap_batch.tasks.stage import Stage, write_summary
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinksTask:
-    """Compare the poses of one camera with the tracks of its video.
+    """Compare the poses of one camera with the tracks of its video, and withdraw those that they contradict.
 
     Attributes:
         keyframes: The camera's selected keyframes, with the tracks.
@@ -28,28 +29,42 @@ class LinksTask:
 
 
 def run_links(task: LinksTask, context: StageContext, files: Path) -> None:
-    """Store how many frames of each path the tracks confirm and contradict, and how certain the path is."""
-    from bodycap_batch.evaluate.track_check import TrackedVideo, check_with_tracks, count_frames
-    from bodycap_batch.formats.dataclass_files import read_dataclass
+    """Store what the tracks show about each path, and the registration if poses of it are withdrawn.
+
+    The summary holds how many frames of each path the tracks confirm and contradict, and how certain the path
+    is. It counts the poses before those that are contradicted were withdrawn.
+    """
+    from dataclasses import replace
+
+    import numpy as np
+
+    from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
+    from bodycap_batch.evaluate.track_check import (
+        TrackedVideo,
+        check_with_tracks,
+        contradicted_frames,
+        count_frames,
+    )
+    from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
     from bodycap_batch.model.path_uncertainty import path_uncertainty
     from bodycap_batch.model.point_tracks import PointTracks
-    from bodycap_batch.model.scene import OtherPaths
+    from bodycap_batch.model.scene import FrameStatus, OtherPaths
 
-    registration = task.registration.path
-    path = load_registration(registration).trajectory
-    paths = [path]
-    if (registration / f"{OTHER_PATHS}.json").exists():
-        paths += read_dataclass(OtherPaths, registration, OTHER_PATHS).trajectories
-    certainty = path_uncertainty(path)
+    before = task.registration.path
+    registration = load_registration(before)
+    paths = [registration.trajectory]
+    if (before / f"{OTHER_PATHS}.json").exists():
+        paths += read_dataclass(OtherPaths, before, OTHER_PATHS).trajectories
+    certainty = path_uncertainty(paths[0])
     found = {
-        "frame": path.gauge,
-        "posed": bool(path.localised.any()),
+        "frame": paths[0].gauge,
+        "posed": bool(paths[0].localised.any()),
         "sigma": certainty["sigma"],
         "extent": certainty["extent"],
     }
     keyframes = task.keyframes.path
     if not (keyframes / f"{TRACKS}.json").exists():
-        write_summary(files, links=[], **found)
+        write_summary(files, links=[], withdrawn=0, **found)
         return
     tracks = read_dataclass(PointTracks, keyframes, TRACKS)
     chain, maps = load_keyframes(keyframes).rotation_chain, load_map(task.map.path).maps
@@ -60,7 +75,10 @@ def run_links(task: LinksTask, context: StageContext, files: Path) -> None:
         context.progress(done, total, "frames compared")
 
     links = []
-    for path in (each for each in paths if each.gauge in scenes and each.registered.any()):
+    gone = np.zeros((len(paths), len(paths[0].status)), dtype=bool)
+    for path, wrong in zip(paths, gone, strict=True):
+        if path.gauge not in scenes or not path.registered.any():
+            continue
         scene = scenes[path.gauge]
         video = TrackedVideo(
             tracks=tracks,
@@ -71,7 +89,19 @@ def run_links(task: LinksTask, context: StageContext, files: Path) -> None:
         )
         compared = check_with_tracks(video, path.gauge_from_cam, show)
         links.append({"frame": path.gauge, **count_frames(compared)})
-    write_summary(files, links=links, **found)
+        wrong[:] = path.localised & contradicted_frames(compared) & is_on(Mechanism.WITHDRAWN_POSES)
+    withdrawn = int(gone.sum())
+    record_act(Mechanism.WITHDRAWN_POSES, withdrawn)
+    if not withdrawn:
+        write_summary(files, links=links, withdrawn=0, **found)
+        return
+    status = np.where(gone.any(axis=0), FrameStatus.CONTRADICTED, paths[0].status)
+    kept = [path.without(wrong, FrameStatus.CONTRADICTED) for path, wrong in zip(paths, gone, strict=True)]
+    path = replace(kept[0], status=tuple(map(FrameStatus, status)))
+    registration = replace(registration, trajectory=path)
+    replace_registration(registration, before, files, links=links, withdrawn=withdrawn, **found)
+    if len(kept) > 1:
+        write_dataclass(OtherPaths(trajectories=tuple(kept[1:])), files, OTHER_PATHS)
 
 
 LINKS = Stage(

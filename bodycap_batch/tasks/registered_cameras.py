@@ -23,20 +23,6 @@ OTHER_PATHS = "other_paths"
 """Name of the file, without suffix, that holds the poses of a camera in other maps than that of its path."""
 
 
-def keep_sensor(before: Path, files: Path) -> None:
-    """Store what the inertial sensor of a camera gives beside a registration that replaces another one.
-
-    Args:
-        before: Folder of the registration that is replaced.
-        files: Folder of the new one.
-    """
-    from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
-    from bodycap_batch.model.inertial_camera import InertialCamera
-
-    if (before / f"{INERTIAL_CAMERA}.json").exists():
-        write_dataclass(read_dataclass(InertialCamera, before, INERTIAL_CAMERA), files, INERTIAL_CAMERA)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegisteredCameras:
     """The registrations of all cameras, in the form that later stages use.

@@ -11,9 +11,8 @@ from bodycap_batch.config.path_bounds import MAX_CONTRADICTED, MAX_UNCERTAINTY
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
-from bodycap_batch.tasks.registered_cameras import keep_sensor
-from bodycap_batch.tasks.registration import save_registration
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, read_summary
+from bodycap_batch.tasks.registration import replace_registration
+from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
 
 if TYPE_CHECKING:
     from bodycap_batch.model.camera import Camera
@@ -106,9 +105,7 @@ def run_rotations(task: RotationsTask, context: StageContext, files: Path) -> No
     found = before
     if turn is not None:
         found = replace(before, trajectory=rotations_alone(before.trajectory, turn, scene))
-    rolling = bool(read_summary(task.registration.path)["rolling"])
-    save_registration(found, camera, files, rolling=rolling)
-    keep_sensor(task.registration.path, files)
+    replace_registration(found, task.registration.path, files)
 
 
 def _map_of(path: Path, trajectory: Trajectory) -> Map | None:
