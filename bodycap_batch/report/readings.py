@@ -219,7 +219,12 @@ def read_links(metrics: Metrics) -> Reading | None:
         for path in metrics["mapping"]["links"][name]
         if path["contradicted"]
     ]
-    words = {"camera": name, "where": f" ({'; '.join(where)})" if where else ""}
+    withdrawn = sum(path.get("withdrawn", 0) for path in metrics["mapping"]["links"][name])
+    words = {
+        "camera": name,
+        "where": f" ({'; '.join(where)})" if where else "",
+        "withdrawn": f"; {withdrawn} poses are withdrawn for it" if withdrawn else "",
+    }
     return Reading(value=share, metric=metric_path("mapping", "links", name), words=words)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from bodycap_batch.config.path_bounds import MAX_WITHDRAWN
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef
 from bodycap_batch.tasks.loading import TRACKS, load_keyframes, load_map, load_registration
@@ -88,8 +89,10 @@ def run_links(task: LinksTask, context: StageContext, files: Path) -> None:
             rotation_chain=chain,
         )
         compared = check_with_tracks(video, path.gauge_from_cam, show)
-        links.append({"frame": path.gauge, **count_frames(compared)})
-        wrong[:] = path.localised & contradicted_frames(compared) & is_on(Mechanism.WITHDRAWN_POSES)
+        counts = count_frames(compared)
+        if is_on(Mechanism.WITHDRAWN_POSES) and counts["contradicted"] <= MAX_WITHDRAWN * counts["compared"]:
+            wrong[:] = path.localised & contradicted_frames(compared)
+        links.append({"frame": path.gauge, **counts, "withdrawn": int(wrong.sum())})
     withdrawn = int(gone.sum())
     record_act(Mechanism.WITHDRAWN_POSES, withdrawn)
     if not withdrawn:

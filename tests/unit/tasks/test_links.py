@@ -106,13 +106,22 @@ def test_poses_that_the_tracks_contradict_are_withdrawn(tmp_path: Path) -> None:
     assert not np.isfinite(found.gauge_from_cam[gone]).any()
     assert np.array_equal(found.gauge_from_cam[~gone], path.gauge_from_cam[~gone])
     summary = read_summary(out)
-    assert summary["withdrawn"] == summary["contradicted"] == gone.sum()
+    assert summary["withdrawn"] == summary["links"][0]["withdrawn"] == summary["contradicted"] == gone.sum()
     assert (summary["localised"], summary["rolling"]) == (FRAMES - gone.sum(), True)
     assert summary["links"][0]["contradicted"] == np.count_nonzero(gone[::2]), (
         "counted before they were withdrawn"
     )
     assert read_dataclass(Camera, out, "camera").model == LENS.model
     assert read_dataclass(FrameTiming, out, "timing").nominal_fps == 30.0
+
+
+def test_a_path_is_kept_if_it_is_not_known_which_part_is_wrong(tmp_path: Path) -> None:
+    poses = true_path()
+    poses[55:, 0, 3] += 0.5
+    out = compare(tmp_path, path_of(poses))
+    link = read_summary(out)["links"][0]
+    assert (link["withdrawn"], read_summary(out)["withdrawn"]) == (0, 0)
+    assert link["contradicted"] > 0.4 * link["compared"]
 
 
 def test_a_right_path_is_not_stored_again(tmp_path: Path) -> None:
