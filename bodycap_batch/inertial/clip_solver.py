@@ -64,13 +64,7 @@ class ClipSolver:
         """Return a solver in which some frames (N,) count as lost."""
         if not left_out.any():
             return self
-        poses, covariance = self.trajectory.gauge_from_cam.copy(), self.trajectory.covariance.copy()
-        poses[left_out], covariance[left_out] = np.nan, np.nan
-        status = [
-            FrameStatus.CONTRADICTED if is_out else each
-            for each, is_out in zip(self.trajectory.status, left_out.tolist(), strict=True)
-        ]
-        path = replace(self.trajectory, gauge_from_cam=poses, covariance=covariance, status=tuple(status))
+        path = self.trajectory.without(left_out, FrameStatus.CONTRADICTED)
         return ClipSolver(path, self.samples, self.constants)
 
     def solve(self, start: int, end: int, known: BoolArray, growth: float = 1.0) -> SolvedStretch | None:

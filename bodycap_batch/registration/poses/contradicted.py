@@ -40,16 +40,7 @@ def withdraw_contradicted_poses(
     if not inside.any():
         return registration
     record_act(Mechanism.CONTRADICTED_POSES, int(inside.sum()))
-    status = [
-        FrameStatus.CONTRADICTED if withdrawn else before
-        for before, withdrawn in zip(path.status, inside, strict=True)
-    ]
-    poses = np.where(inside[:, None, None], np.nan, path.gauge_from_cam)
-    covariance = np.where(inside[:, None, None], np.nan, path.covariance)
-    return replace(
-        registration,
-        trajectory=replace(path, status=tuple(status), gauge_from_cam=poses, covariance=covariance),
-    )
+    return replace(registration, trajectory=path.without(inside, FrameStatus.CONTRADICTED))
 
 
 def contradicted_frames(path: Trajectory, maps: Sequence[Map], misplaced: Collection[int]) -> BoolArray:

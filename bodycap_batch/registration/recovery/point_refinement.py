@@ -59,18 +59,7 @@ def remove_weak_boundary_poses(path: Trajectory, min_inliers: int) -> Trajectory
         has_pose[_first_supported(weak, start - 1, -1) + 1 : start] = False
         has_pose[stop : _first_supported(weak, stop, 1)] = False
     removed = path.localised & ~has_pose
-    if not removed.any():
-        return path
-    status = [
-        FrameStatus.UNCONFIRMED if is_removed else status_
-        for status_, is_removed in zip(path.status, removed, strict=True)
-    ]
-    return replace(
-        path,
-        status=tuple(status),
-        gauge_from_cam=np.where(removed[:, None, None], np.nan, path.gauge_from_cam),
-        covariance=np.where(removed[:, None, None], np.nan, path.covariance),
-    )
+    return path.without(removed, FrameStatus.UNCONFIRMED) if removed.any() else path
 
 
 def _first_supported(weak: BoolArray, frame: int, step: int) -> int:
