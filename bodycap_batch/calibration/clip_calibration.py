@@ -263,7 +263,7 @@ def corner_coverage(pixels: Sequence[FloatArray], size: ImageSize) -> float:
     """
     cells = np.array(_COVERAGE_CELLS)
     cell = np.floor((np.concatenate(pixels) + 0.5) / np.array(size) * cells).astype(int)
-    return len(np.unique(np.clip(cell, 0, cells - 1), axis=0)) / cells.prod().item()
+    return len(np.unique(np.clip(cell, 0, cells - 1), axis=0)) / float(cells.prod())
 
 
 def _notes(fit: IntrinsicsFit, size: ImageSize, coverage: float, mode: VideoMode) -> list[str]:
