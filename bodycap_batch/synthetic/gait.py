@@ -8,7 +8,7 @@ is a spline through given positions.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -39,11 +39,9 @@ _LAP = np.array(
 """Positions on one lap. Columns: time (seconds); x and y (metres from the room's middle); direction of the
 face (degrees from +x, counter-clockwise). The lap starts with steps to the right while the person faces a
 wall, because a map is easy to initialise from sideways movement."""
-_TURNING = (0.02, 0.02, 75.0), (1.1, 0.9, 2 * np.pi / 5.0)
-"""Motion of a person who rotates on the spot: amplitudes (m, m, degrees) and angular frequencies (rad/s) of
-x, y and heading."""
-_STILL = (0.003, 0.003, 0.4), (1.3, 0.9, 0.7)
-"""The same of a person who stands still. Evidence: none."""
+_TURN_S, _TURN_DEG, _SWAY_M = 5.0, 75.0, 0.02
+"""Motion of a person who rotates on the spot: period (s), maximum rotation to each side (degrees), amplitude
+of the sway (m)."""
 _STILL_NOD_DEG = 22.0
 """Nod (degrees) of a person who looks at a table. Neck and head each turn by 0.6 of it."""
 _STILL_PARTS, _STILL_SHARE, _STILL_ARMS_AHEAD = ("Bend", "Lean", "Turn", "Look", "Nod"), 0.12, 0.7
@@ -51,8 +49,6 @@ _STILL_PARTS, _STILL_SHARE, _STILL_ARMS_AHEAD = ("Bend", "Lean", "Turn", "Look",
 are ahead. Evidence: none."""
 _ARM_PARTS = ("Lift", "Ahead", "Arm", "Out", "Spin", "Elbow", "Twist")
 """Names of the angles of an arm's posture, which `WalkStyle.posture` explains."""
-_ARM_WAVES = ("Arm", "Out", "Elbow", "Twist", "Wrist", "Radial")
-"""Names of the angles of an arm that oscillate slowly."""
 _SAMPLE_HZ = 50.0
 """Sampling rate (Hz) of the two splines that describe the gait phase and the height of the root."""
 
@@ -151,13 +147,12 @@ class Walk:
         self._t_pose_s = style.t_pose_s
         self._arms_ahead = max(style.arms_ahead, _STILL_ARMS_AHEAD if style.still else 0.0)
         self._nod_deg = _STILL_NOD_DEG if style.still else 3.0
-        self._style = style
+        self._presses = style.presses
+        self._posture = style.posture
         # Use separate random streams, so that a longer capture starts with the walk of a shorter capture.
         for_path, for_reaches, rng = rng.spawn(3)
-        if style.still or style.on_the_spot:
-            self._route = _draw_standing(length_s, for_path, *(_STILL if style.still else _TURNING))
-        else:
-            self._route = _draw_path(length_s, for_path)
+        draw = _draw_stillness if style.still else _draw_turns if style.on_the_spot else _draw_path
+        self._route = draw(length_s, for_path)
         self._stride_gain = float(rng.uniform(0.92, 1.08))
         self._oscillations = {
             name: _draw_oscillation(
@@ -233,7 +228,7 @@ class Walk:
         ]
         out = {"Hips": rotation_about("Z", pelvis_yaw) * rotation_about("XY", np.column_stack(pelvis_tilt))}
         twist = walk_weight * (wave["Turn"](t_s) - 3.0 * stride * np.cos(phase))
-        bend, turn = (self._style.posture.get(part, 0.0) for part in ("Bend", "Turn"))
+        bend, turn = (self._posture.get(part, 0.0) for part in ("Bend", "Turn"))
         for share, name in ((0.45, "Spine"), (0.55, "Spine1")):
             angles = [
                 share * twist + share * turn,
@@ -286,12 +281,15 @@ class Walk:
     ) -> None:
         """Add the rotations of clavicle, shoulder, elbow and wrist of one arm.
 
-        The arm swings opposite to the leg. Slow oscillations and reaching are added.
+        The arm swings opposite to the leg. Slow oscillations, reaching and presses are added.
         """
         forth, walk_weight = swing
-        wave = {part: self._oscillations[side + part](t_s) for part in _ARM_WAVES}
-        flexion, abduction = 4.0 + 11.0 * forth + wave["Arm"], 10.0 + wave["Out"]
-        elbow, pronation = 24.0 + 7.0 * forth + wave["Elbow"], 8.0 + wave["Twist"]
+        wave, outward = self._oscillations, 1.0 if side == "Left" else -1.0
+        held = {part: self._posture.get(side + part, 0.0) for part in _ARM_PARTS}
+        flexion = 4.0 + held["Arm"] + 11.0 * forth + wave[f"{side}Arm"](t_s)
+        abduction = 10.0 + held["Out"] + wave[f"{side}Out"](t_s)
+        elbow = 24.0 + held["Elbow"] + 7.0 * forth + wave[f"{side}Elbow"](t_s)
+        pronation = 8.0 + held["Twist"] + wave[f"{side}Twist"](t_s)
         flexion, elbow = flexion + 25.0 * self._arms_ahead, elbow + 60.0 * self._arms_ahead
         lift = np.zeros_like(t_s)
         for reach in self._reaches:
@@ -305,43 +303,18 @@ class Walk:
             abduction=abduction,
             elbow=elbow,
             pronation=pronation,
-            spin=np.zeros_like(t_s),
-            wrist=wave["Wrist"],
-            radial=wave["Radial"],
+            spin=np.full_like(t_s, held["Spin"]),
+            wrist=wave[f"{side}Wrist"](t_s),
+            radial=wave[f"{side}Radial"](t_s),
         )
-        out.update(pose_arm(self._style, side, t_s, angles, lift, walk_weight))
-
-
-def pose_arm(
-    style: WalkStyle, side: str, t_s: FloatArray, angles: ArmAngles, lift: FloatArray, free: FloatArray
-) -> dict[str, Rotation]:
-    """Return the local rotations of one arm by joint name, with the person's posture and presses.
-
-    Args:
-        style: The posture and the presses.
-        side: ``Left`` or ``Right``.
-        t_s: (T,) common times, seconds.
-        angles: Angles of the arm of a person with the mean posture.
-        lift: (T,) additional lift of the shoulder girdle, degrees.
-        free: (T,) weight of the angles: 0 in a T-pose.
-    """
-    outward = 1.0 if side == "Left" else -1.0
-    held = {part: style.posture.get(side + part, 0.0) for part in _ARM_PARTS}
-    angles = replace(
-        angles,
-        flexion=angles.flexion + held["Arm"],
-        abduction=angles.abduction + held["Out"],
-        elbow=angles.elbow + held["Elbow"],
-        pronation=angles.pronation + held["Twist"],
-        spin=angles.spin + held["Spin"],
-    )
-    for press in style.presses:
-        if press.side == side:
-            angles, lift = press.blended(angles, t_s), lift * (1.0 - press.weight(t_s))
-    shoulder = rotation_about("Y", -outward * (free * lift + held["Lift"]))
-    if held["Ahead"]:
-        shoulder = rotation_about("Z", np.full_like(t_s, -outward * held["Ahead"])) * shoulder
-    return {f"{side}Shoulder": shoulder, **angles.rotations(side, free)}
+        for press in self._presses:
+            if press.side == side:
+                angles, lift = press.blended(angles, t_s), lift * (1.0 - press.weight(t_s))
+        shoulder = rotation_about("Y", -outward * (walk_weight * lift + held["Lift"]))
+        if held["Ahead"]:
+            shoulder = rotation_about("Z", np.full_like(t_s, -outward * held["Ahead"])) * shoulder
+        out[f"{side}Shoulder"] = shoulder
+        out.update(angles.rotations(side, walk_weight))
 
 
 def _draw_path(length_s: float, rng: np.random.Generator) -> CubicSpline:
@@ -356,20 +329,22 @@ def _draw_path(length_s: float, rng: np.random.Generator) -> CubicSpline:
     return CubicSpline(knots[:, 0], knots[:, 1:])
 
 
-def _draw_standing(
-    length_s: float, rng: np.random.Generator, sizes: tuple[float, ...], rates: tuple[float, ...]
-) -> CubicSpline:
-    """Return x, y (m) and heading (degrees) over time for a person who sways or turns in the room's middle.
-
-    Args:
-        length_s: Latest common time of the capture, seconds.
-        rng: Source of randomness for the phases.
-        sizes: Amplitudes of x, y and heading, metres and degrees. The mean heading is +y.
-        rates: Their angular frequencies, rad/s.
-    """
+def _draw_turns(length_s: float, rng: np.random.Generator) -> CubicSpline:
+    """Return x, y (m) and heading (degrees) over time for a person who rotates on the spot."""
     times = np.arange(-2.0 * MARGIN_S, length_s + 2.0 * MARGIN_S, 0.1)
-    waves = np.sin(np.outer(times, rates) + rng.uniform(0, 2 * np.pi, 3))
-    return CubicSpline(times, waves * sizes + (0.0, 0.0, 90.0))
+    phase = rng.uniform(0, 2 * np.pi, 3)
+    x, y = (_SWAY_M * np.sin(rate * times + phase[axis]) for axis, rate in enumerate((1.1, 0.9)))
+    heading = 90.0 + _TURN_DEG * np.sin(2 * np.pi * times / _TURN_S + phase[2])
+    return CubicSpline(times, np.column_stack([x, y, heading]))
+
+
+def _draw_stillness(length_s: float, rng: np.random.Generator) -> CubicSpline:
+    """Return x, y (m) and heading (degrees) over time for a person who stands still and faces +y."""
+    times = np.arange(-2.0 * MARGIN_S, length_s + 2.0 * MARGIN_S, 0.1)
+    phase = rng.uniform(0, 2 * np.pi, 3)
+    waves = [np.sin(rate * times + start) for rate, start in zip((1.3, 0.9, 0.7), phase, strict=True)]
+    x, y, heading = (size * wave for size, wave in zip((0.003, 0.003, 0.4), waves, strict=True))
+    return CubicSpline(times, np.column_stack([x, y, 90.0 + heading]))
 
 
 def _draw_reaches(length_s: float, t_pose_s: float, rng: np.random.Generator) -> tuple[_ArmReach, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -111,30 +111,30 @@ class Bout:
 
 
 @dataclass(slots=True, kw_only=True)
-class Stance:
-    """A time in which one foot stands. The first stance starts before the plan, the last one ends after it.
+class Footprints:
+    """The stances of one foot. The first stance starts before the plan, the last one ends after it.
 
     Attributes:
-        strike_s: Time at which the foot touches the floor, seconds.
-        place_m: (2,) place of the ankle above the floor, metres.
-        yaw_deg: Direction of the foot, degrees; 0: towards −y. It does not jump by 360 degrees.
-        strike_deg: Angle of the foot at the first contact, degrees; negative: the toes are up.
-        cycle_s: Duration of the gait cycle that ends with the swing before the stance, seconds.
-        speed_m_s: Speed in this cycle, metres per second.
-        stride: Way of the foot in the swing before the stance, forward, as a share of the usual stride.
-        off_s: Time at which the foot leaves the floor, seconds.
-        off_deg: Angle of the foot at the last contact, degrees; positive: the heel is up.
+        strike_s: Times at which the foot touches the floor, seconds.
+        off_s: Times at which the foot leaves the floor, seconds.
+        place_m: Places of the ankle above the floor, metres.
+        yaw_deg: Directions of the foot, degrees; 0: towards −y. They do not jump by 360 degrees.
+        strike_deg: Angles of the foot at the first contact, degrees; negative: the toes are up.
+        off_deg: Angles of the foot at the last contact, degrees; positive: the heel is up.
+        cycle_s: Durations of the gait cycle that ends with the swing before the stance, seconds.
+        speed_m_s: Speeds in this cycle, metres per second.
+        stride: Ways of the foot in the swing before the stance, forward, as shares of the usual stride.
     """
 
-    strike_s: float
-    place_m: FloatArray
-    yaw_deg: float
-    strike_deg: float
-    cycle_s: float
-    speed_m_s: float
-    stride: float
-    off_s: float = float("inf")
-    off_deg: float = 0.0
+    strike_s: list[float] = field(default_factory=list)
+    off_s: list[float] = field(default_factory=list)
+    place_m: list[FloatArray] = field(default_factory=list)
+    yaw_deg: list[float] = field(default_factory=list)
+    strike_deg: list[float] = field(default_factory=list)
+    off_deg: list[float] = field(default_factory=list)
+    cycle_s: list[float] = field(default_factory=list)
+    speed_m_s: list[float] = field(default_factory=list)
+    stride: list[float] = field(default_factory=list)
 
 
 class Plan:
@@ -152,7 +152,7 @@ class Plan:
         self, length_s: float, still_s: float, walker: Walker, on_the_spot: bool, rng: np.random.Generator
     ) -> None:
         self.walker, self.bouts = walker, list[Bout]()
-        self.feet: tuple[list[Stance], list[Stance]] = ([], [])
+        self.feet = (Footprints(), Footprints())
         self._rng, for_places = rng.spawn(2)
         self._rows = [np.array([-3.0 * MARGIN_S, 0.0, 0.0, float(self._rng.uniform(-180, 180))])]
         self._stand_until(still_s + float(self._rng.uniform(0.3, 0.8)))
@@ -174,6 +174,9 @@ class Plan:
         rows = np.array(self._rows)
         self._path = CubicSpline(rows[:, 0], rows[:, 1:])
         self._place_feet(for_places)
+        for foot in self.feet:
+            foot.off_s.append(float("inf"))
+            foot.off_deg.append(0.0)
 
     @property
     def end_s(self) -> float:
@@ -300,17 +303,13 @@ class Plan:
         """Put both feet beside the body at the start."""
         here = self._rows[-1][1:]
         for number, foot in enumerate(self.feet):
-            foot.append(
-                Stance(
-                    strike_s=-float("inf"),
-                    place_m=here[:2] + self._aside_of(number, here[2]),
-                    yaw_deg=here[2] + self._toe_out(number),
-                    strike_deg=0.0,
-                    cycle_s=1.1,
-                    speed_m_s=0.0,
-                    stride=0.0,
-                )
-            )
+            foot.strike_s.append(-float("inf"))
+            foot.place_m.append(here[:2] + self._aside_of(number, here[2]))
+            foot.yaw_deg.append(here[2] + self._toe_out(number))
+            foot.strike_deg.append(0.0)
+            foot.cycle_s.append(1.1)
+            foot.speed_m_s.append(0.0)
+            foot.stride.append(0.0)
 
     def _aside_of(self, number: int, yaw_deg: float) -> FloatArray:
         """Return the way (2,) in metres from the body to a foot."""
@@ -327,7 +326,7 @@ class Plan:
             steps = np.diff(bout.strikes_s, prepend=bout.start_s)
             for index, (strike, step) in enumerate(zip(bout.strikes_s, steps, strict=True)):
                 number = (bout.first + index) % 2
-                before = self.feet[number][-1]
+                foot = self.feet[number]
                 cycle = (
                     float(steps[max(index, 1) - 1 : index + 2].mean()) * 2.0
                     if bout.kind == "walk"
@@ -347,7 +346,7 @@ class Plan:
                 if not last and bout.kind == "walk":
                     place = place + 0.008 * rng.normal(size=2)
                 yaw = float(body[2]) + self._toe_out(number)
-                stride = float((place - before.place_m) @ _forward(yaw)) / usual
+                stride = float((place - foot.place_m[-1]) @ _forward(yaw)) / usual
                 off = float(strike - (1.0 - share) * cycle)
                 if index and bout.kind == "walk":
                     # The last steps take longer. The foot behind leaves the floor when it usually does.
@@ -357,20 +356,16 @@ class Plan:
                 if bout.kind == "walk":
                     at = self.body(np.array([strike, off]))
                     ahead = float((place - at[0, :2]) @ _forward(at[0, 2])) / (_AHEAD * usual)
-                    behind = float((at[1, :2] - before.place_m) @ _forward(at[1, 2])) / (_BEHIND * usual)
-                before.off_s = off
-                before.off_deg = _OFF_DEG[bout.kind] * float(np.clip(behind, 0.2, 1.15)) ** 0.7
-                self.feet[number].append(
-                    Stance(
-                        strike_s=float(strike),
-                        place_m=place,
-                        yaw_deg=yaw,
-                        strike_deg=_STRIKE_DEG[bout.kind] * float(np.clip(ahead, 0.0, 1.15)),
-                        cycle_s=cycle,
-                        speed_m_s=bout.speed_m_s,
-                        stride=stride,
-                    )
-                )
+                    behind = float((at[1, :2] - foot.place_m[-1]) @ _forward(at[1, 2])) / (_BEHIND * usual)
+                foot.off_s.append(off)
+                foot.off_deg.append(_OFF_DEG[bout.kind] * float(np.clip(behind, 0.2, 1.15)) ** 0.7)
+                foot.strike_s.append(float(strike))
+                foot.place_m.append(place)
+                foot.yaw_deg.append(yaw)
+                foot.strike_deg.append(_STRIKE_DEG[bout.kind] * float(np.clip(ahead, 0.0, 1.15)))
+                foot.cycle_s.append(cycle)
+                foot.speed_m_s.append(bout.speed_m_s)
+                foot.stride.append(stride)
 
 
 def smooth_step(x: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ angles of both legs follow from the places of root and feet.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.synthetic.foot_roll import FootShape, foot_rotation, shape_of, toe_pitch_deg
-from bodycap_batch.synthetic.gait import WalkStyle, pose_arm
+from bodycap_batch.synthetic.gait import WalkStyle
 from bodycap_batch.synthetic.gait_curves import (
     REFERENCE_M_S,
     hip_flexion_deg,
@@ -28,7 +28,7 @@ from bodycap_batch.synthetic.gait_curves import (
     stance_share,
     steps_per_s,
 )
-from bodycap_batch.synthetic.gait_plan import MARGIN_S, Plan, Stance, draw_walker, smooth_step
+from bodycap_batch.synthetic.gait_plan import MARGIN_S, Footprints, Plan, draw_walker, smooth_step
 from bodycap_batch.synthetic.pressing import ArmAngles
 
 _SIDES = ("Left", "Right")
@@ -45,6 +45,9 @@ until toe off."""
 _ROLLING_DEG = 20.0
 """Angle of the foot at toe off, degrees, above which the foot rolls over the toes as in walking. With less,
 the heel rises only while both feet stand."""
+_RISE_POWERS = (1.3, 3.5)
+"""Smallest and largest power of the angle of the foot over time. Origin: with less, the heel would rise with
+a jerk; with more, the foot would be flat until shortly before toe off."""
 _STANDING_KNEE_DEG = 5.0
 """Flexion of the knees of a standing person, degrees. Evidence: none."""
 _STRAIGHTEST_KNEE_DEG = 3.0
@@ -78,7 +81,10 @@ _LIFT_DEG = {"hip": 12.0, "knee": 27.0}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Foot:
-    """One foot: its shape and its N stances, as arrays. `Stance` explains the fields."""
+    """One foot: its shape and its N stances, as arrays. `Footprints` explains the fields.
+
+    `rise_power` (N,) is the power of the angle of the foot over time while the heel rises.
+    """
 
     side: str
     number: int
@@ -92,6 +98,7 @@ class _Foot:
     cycle_s: FloatArray
     speed_m_s: FloatArray
     stride: FloatArray
+    rise_power: FloatArray
 
     def stance_at(self, t_s: FloatArray) -> tuple[IntArray, IntArray, BoolArray]:
         """Return the numbers of the latest stance (T,) and of the next one (T,), and if the foot stands (T,).
@@ -115,11 +122,12 @@ class _Foot:
         return np.where(stands, 0.0, t_s - np.where(stands, 0.0, start)) / length, length
 
 
-def _as_arrays(side: str, number: int, shape: FootShape, stances: list[Stance]) -> _Foot:
-    """Return a foot with its stances as arrays."""
-    names = [each.name for each in fields(Stance)]
-    arrays = {name: np.array([getattr(stance, name) for stance in stances]) for name in names}
-    return _Foot(side=side, number=number, shape=shape, **arrays)
+def _as_arrays(side: str, number: int, shape: FootShape, prints: Footprints) -> _Foot:
+    """Return a foot with its footprints as arrays."""
+    arrays = {each.name: np.array(getattr(prints, each.name)) for each in fields(prints)}
+    return _Foot(
+        side=side, number=number, shape=shape, rise_power=np.full(len(prints.strike_s), _RISE_POWER), **arrays
+    )
 
 
 class StanceWalk:
@@ -165,16 +173,17 @@ class StanceWalk:
     def pose(self, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return root positions (T,3) in the world (m) and local rotations (T,J,3,3) at common times (T,)."""
         t_s = np.asarray(t_s, dtype=np.float64)
-        turns, pelvis = self._turns(t_s), self._pelvis(t_s)
+        root, turns = self._root(t_s), self._turns(t_s)
+        pelvis = Rotation.from_euler("ZYX", turns[:, :3], degrees=True)
         out = {"Hips": pelvis}
         for foot in self._feet:
-            self._leg(foot, t_s, pelvis, out)
+            self._leg(foot, t_s, root, pelvis, out)
         self._trunk(turns, pelvis, out)
         for number, side in enumerate(_SIDES):
             self._arm(side, t_s, self._swings(t_s)[:, 2 * number : 2 * number + 2], out)
         identity = Rotation.identity(len(t_s))
         local = np.stack([out.get(name, identity).as_matrix() for name in self.skeleton.joints], axis=1)
-        return np.asarray(self._root(t_s)), local
+        return root, local
 
     def contacts(self, start_s: float, end_s: float) -> dict[str, FloatArray]:
         """Return the stances (N,2) of each foot, by side: heel strike and toe off, seconds.
@@ -202,7 +211,8 @@ class StanceWalk:
             risen = np.clip(1.0 - (foot.off_s[index] - t_s) / rise_s, 0.0, None)
         risen = np.where(np.isfinite(foot.off_s[index]), risen, 0.0)
         return np.asarray(
-            foot.strike_deg[index] * (1.0 - smooth_step(after)) + foot.off_deg[index] * risen**_RISE_POWER
+            foot.strike_deg[index] * (1.0 - smooth_step(after))
+            + foot.off_deg[index] * risen ** foot.rise_power[index]
         )
 
     def _stance_ankle(self, foot: _Foot, index: IntArray, t_s: FloatArray) -> FloatArray:
@@ -291,14 +301,19 @@ class StanceWalk:
         sway = self._sway(t_s, body, weights)
         root = np.column_stack([body[:, :2] + sway, np.zeros(len(t_s))])
         pelvis = Rotation.from_euler("ZYX", turns[:, :3], degrees=True)
-        root[:, 2] = self._height(t_s, root, pelvis)
+        root[:, 2] = self._height(t_s, root, pelvis)[0]
+        for _ in range(2):
+            self._root = CubicSpline(t_s, root)
+            self._feet = tuple(self._with_rise(foot) for foot in self._feet)
+            root[:, 2] = self._height(t_s, root, pelvis)[0]
+        root[:, 2] = self._height(t_s, root, pelvis)[1]
         self._root = CubicSpline(t_s, root)
 
-    def _height(self, t_s: FloatArray, root: FloatArray, pelvis: Rotation) -> FloatArray:
+    def _height(self, t_s: FloatArray, root: FloatArray, pelvis: Rotation) -> tuple[FloatArray, FloatArray]:
         """Return the height (T,) of the root in metres at which the standing knees follow their curves.
 
-        The leg in front counts from shortly before its heel strike. The height is limited to what both legs
-        can reach.
+        The leg in front counts from shortly before its heel strike. The second height (T,) is limited to what
+        both legs can reach.
         """
         heights: list[FloatArray] = []
         loads: list[FloatArray] = []
@@ -327,7 +342,37 @@ class StanceWalk:
         # Spread each lowering over the time around it, so that it starts and ends smoothly.
         around = 2 * _SPREAD
         excess = maximum_filter1d(wanted - reached, 2 * around + 1)
-        return np.asarray(wanted - gaussian_filter1d(excess, _SPREAD, radius=around))
+        return wanted, np.asarray(wanted - gaussian_filter1d(excess, _SPREAD, radius=around))
+
+    def _with_rise(self, foot: _Foot) -> _Foot:
+        """Return a foot whose heel rises so that its knee has the angle of the curve when both feet stand.
+
+        The time at which the other foot strikes counts.
+        """
+        index = np.flatnonzero(foot.off_deg > _ROLLING_DEG)
+        if not len(index):
+            return foot
+        later = foot.after(index)
+        share = stance_share(foot.speed_m_s[later])
+        rise_s = np.minimum(
+            (share - _HEEL_RISE_AT) * foot.cycle_s[later], 0.6 * (foot.off_s[index] - foot.strike_s[index])
+        )
+        both_s = self._both_s(foot, later)
+        at = foot.off_s[index] - both_s
+        pelvis = Rotation.from_euler("ZYX", self._turns(at)[:, :3], degrees=True)
+        hip = self._root(at) + pelvis.apply(self._hips_m[foot.number])
+        wanted = self._reach_m(np.maximum(self._knee_curve(foot, at), _STRAIGHTEST_KNEE_DEG))
+        tried = np.linspace(0.0, 1.0, 60)
+        misfit = []
+        for part in tried:
+            pitch = part * foot.off_deg[index]
+            ankle = foot.shape.ankle_on_floor(foot.place_m[index], foot.yaw_deg[index], pitch)
+            misfit.append(np.abs(np.linalg.norm(ankle - hip, axis=1) - wanted))
+        best = np.maximum(tried[np.argmin(misfit, axis=0)], 1e-3)
+        power = np.log(best) / np.log(1.0 - both_s / rise_s)
+        powers = foot.rise_power.copy()
+        powers[index] = np.clip(power, *_RISE_POWERS)
+        return replace(foot, rise_power=powers)
 
     @staticmethod
     def _both_s(foot: _Foot, index: IntArray) -> FloatArray:
@@ -383,14 +428,6 @@ class StanceWalk:
 
     # The legs.
 
-    def _pelvis(self, t_s: FloatArray) -> Rotation:
-        """Return the orientations (T) of the pelvis in the world."""
-        return Rotation.from_euler("ZYX", self._turns(t_s)[:, :3], degrees=True)
-
-    def _hips(self, foot: _Foot, t_s: FloatArray) -> FloatArray:
-        """Return the hip (T,3) of the leg of a foot in the world, metres."""
-        return np.asarray(self._root(t_s) + self._pelvis(t_s).apply(self._hips_m[foot.number]))
-
     def _curve_ankle(self, foot: _Foot, index: IntArray, t_s: FloatArray) -> FloatArray:
         """Return the ankle (T,3) of the curves in the swings after the stances `index` (T,), metres."""
         later = index + 1
@@ -413,7 +450,8 @@ class StanceWalk:
                 -self._thigh_m * np.cos(thigh) - self._shank_m * np.cos(shank),
             ]
         )
-        hips = self._hips(foot, t_s)
+        pelvis = Rotation.from_euler("ZYX", self._turns(t_s)[:, :3], degrees=True)
+        hips = self._root(t_s) + pelvis.apply(self._hips_m[foot.number])
         return np.asarray(hips + Rotation.from_euler("Z", yaw[:, None], degrees=True).apply(leg))
 
     def _find_corrections(self, foot: _Foot) -> FloatArray:
@@ -421,15 +459,14 @@ class StanceWalk:
         count = len(foot.strike_s) - 1
         index = np.arange(count)
         step = 1e-3
-
-        def apart(stance: IntArray, t_s: FloatArray) -> FloatArray:
-            return self._stance_ankle(foot, stance, t_s) - self._curve_ankle(foot, index, t_s)
-
         out = np.zeros((count, 4, 3))
         for place, (times, stance) in enumerate(((foot.off_s[:-1], index), (foot.strike_s[1:], index + 1))):
             side = -step if place == 0 else step
-            out[:, 2 * place] = apart(stance, times)
-            out[:, 2 * place + 1] = (apart(stance, times + side) - out[:, 2 * place]) / side
+            here = self._stance_ankle(foot, stance, times) - self._curve_ankle(foot, index, times)
+            there = self._stance_ankle(foot, stance, times + side) - self._curve_ankle(
+                foot, index, times + side
+            )
+            out[:, 2 * place], out[:, 2 * place + 1] = here, (there - here) / side
         out[:, 3, :2] += _LANDING_SHARE * self._root(foot.strike_s[1:], 1)[:, :2]
         return out
 
@@ -458,7 +495,8 @@ class StanceWalk:
         least = _CLEARANCE_M * np.sin(np.pi * x) ** 2
         soft = _SOFT_CLEARANCE_M * np.sin(np.pi * x) ** 2 + 1e-9
         ankle[:, 2] = least - soles + soft * np.logaddexp(0.0, (ankle[:, 2] + soles - least) / soft)
-        hips = self._hips(foot, at)
+        pelvis = Rotation.from_euler("ZYX", self._turns(at)[:, :3], degrees=True)
+        hips = self._root(at) + pelvis.apply(self._hips_m[foot.number])
         way = ankle - hips
         distance = np.linalg.norm(way, axis=1)
         longest = float(self._reach_m(np.array(_STRAIGHTEST_KNEE_DEG)))
@@ -466,10 +504,13 @@ class StanceWalk:
         out[flying] = hips + way * (kept / distance)[:, None]
         return out
 
-    def _leg(self, foot: _Foot, t_s: FloatArray, pelvis: Rotation, out: dict[str, Rotation]) -> None:
+    def _leg(
+        self, foot: _Foot, t_s: FloatArray, root: FloatArray, pelvis: Rotation, out: dict[str, Rotation]
+    ) -> None:
         """Add the rotations of hip, knee, ankle and toes of one leg, so that the foot has its place."""
         yaw, pitch = self._foot_angles(foot, t_s)
-        way = self._ankle(foot, t_s, yaw, pitch) - self._hips(foot, t_s)
+        hip = root + pelvis.apply(self._hips_m[foot.number])
+        way = self._ankle(foot, t_s, yaw, pitch) - hip
         a, b = self._thigh_m, self._shank_m
         distance = np.clip(np.linalg.norm(way, axis=1), abs(a - b) + 1e-6, a + b - 1e-9)
         knee = np.arccos(np.clip((distance**2 - a * a - b * b) / (2 * a * b), -1, 1))
@@ -512,19 +553,31 @@ class StanceWalk:
 
     def _arm(self, side: str, t_s: FloatArray, swing: FloatArray, out: dict[str, Rotation]) -> None:
         """Add the rotations of clavicle, shoulder, elbow and wrist of one arm."""
-        ahead, nothing = self._style.arms_ahead, np.zeros_like(t_s)
+        outward = 1.0 if side == "Left" else -1.0
+        held = {
+            part: self._style.posture.get(side + part, 0.0)
+            for part in ("Lift", "Ahead", "Arm", "Out", "Spin", "Elbow", "Twist")
+        }
+        ahead = self._style.arms_ahead
         angles = ArmAngles(
-            flexion=-3.0 + 25.0 * ahead + (1.0 - 0.6 * ahead) * swing[:, 0],
-            abduction=nothing + 9.0,
-            elbow=8.0 + 60.0 * ahead + swing[:, 1],
-            pronation=nothing + 8.0,
-            spin=nothing,
+            flexion=-3.0 + held["Arm"] + 25.0 * ahead + (1.0 - 0.6 * ahead) * swing[:, 0],
+            abduction=np.full_like(t_s, 9.0 + held["Out"]),
+            elbow=8.0 + held["Elbow"] + 60.0 * ahead + swing[:, 1],
+            pronation=np.full_like(t_s, 8.0 + held["Twist"]),
+            spin=np.full_like(t_s, held["Spin"]),
             wrist=0.1 * swing[:, 0],
-            radial=nothing,
+            radial=np.zeros_like(t_s),
         )
+        for press in self._style.presses:
+            if press.side == side:
+                angles = press.blended(angles, t_s)
+        shoulder = Rotation.from_euler(
+            "ZY", np.tile([-outward * held["Ahead"], -outward * held["Lift"]], (len(t_s), 1)), degrees=True
+        )
+        out[f"{side}Shoulder"] = shoulder
         end_s = self._style.t_pose_s
         free = smooth_step(t_s - end_s) if end_s else np.ones_like(t_s)
-        out.update(pose_arm(self._style, side, t_s, angles, nothing, free))
+        out.update(angles.rotations(side, free))
 
 
 def _slow_drift(t_s: FloatArray, rng: np.random.Generator, count: int) -> FloatArray:
