@@ -5,6 +5,7 @@ Pixels have OpenCV's origin: the centre of the first pixel is (0, 0).
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -61,7 +62,6 @@ class CalibrationBoard:
     dictionary: str = "4X4_50"
     marker: float = 0.75
     legacy: bool = False
-    _charuco: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
     _inverted: list[bool] = field(default_factory=lambda: [False], init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -118,7 +118,7 @@ class CalibrationBoard:
 
     def _find_charuco(self, image: GreyImage) -> BoardCorners | None:
         """Find the corners of a ChArUco board that is printed black on white; None if there are too few."""
-        detector, board = self._detector()
+        detector, board = _detector(self)
         corners, ids, _, _ = detector.detectBoard(image)
         if ids is None or len(ids) < MIN_CORNERS or board.checkCharucoCornersCollinear(ids):
             return None
@@ -134,7 +134,7 @@ class CalibrationBoard:
         Args:
             square_px: Side of a square, px.
         """
-        _, board = self._detector()
+        _, board = _detector(self)
         size = (self.columns * square_px, self.rows * square_px)
         return np.asarray(board.generateImage(size), dtype=np.uint8)
 
@@ -152,24 +152,24 @@ class CalibrationBoard:
             board_m=on_board.astype(np.float64), px=np.asarray(corners, dtype=np.float64).reshape(-1, 2)
         )
 
-    def _detector(self) -> tuple[Any, Any]:
-        """Return OpenCV's ChArUco detector and board. Both are created at the first call."""
-        import cv2
 
-        if not self._charuco:
-            name = f"DICT_{self.dictionary.upper().removeprefix('DICT_')}"
-            if not hasattr(cv2.aruco, name):
-                known = sorted(item[5:] for item in dir(cv2.aruco) if item.startswith("DICT_"))
-                raise JobError(
-                    f"there is no family of markers {self.dictionary!r}",
-                    field="--dictionary",
-                    hint=f"choose one of {', '.join(known)}",
-                )
-            markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-            board = cv2.aruco.CharucoBoard((self.columns, self.rows), 1.0, self.marker, markers)
-            board.setLegacyPattern(self.legacy)
-            self._charuco.extend([cv2.aruco.CharucoDetector(board), board])
-        return self._charuco[0], self._charuco[1]
+@functools.cache
+def _detector(board: CalibrationBoard) -> tuple[Any, Any]:
+    """Return OpenCV's ChArUco detector and board."""
+    import cv2
+
+    name = f"DICT_{board.dictionary.upper().removeprefix('DICT_')}"
+    if not hasattr(cv2.aruco, name):
+        known = sorted(item[5:] for item in dir(cv2.aruco) if item.startswith("DICT_"))
+        raise JobError(
+            f"there is no family of markers {board.dictionary!r}",
+            field="--dictionary",
+            hint=f"choose one of {', '.join(known)}",
+        )
+    markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    charuco = cv2.aruco.CharucoBoard((board.columns, board.rows), 1.0, board.marker, markers)
+    charuco.setLegacyPattern(board.legacy)
+    return cv2.aruco.CharucoDetector(charuco), charuco
 
 
 def _refine_corners(image: GreyImage, corners: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

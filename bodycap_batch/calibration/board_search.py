@@ -12,7 +12,7 @@ import numpy as np
 
 from bodycap_batch.calibration.board_detection import CalibrationBoard, GreyImage
 from bodycap_batch.calibration.intrinsics_fit import fit_intrinsics
-from bodycap_batch.capture import open_camera
+from bodycap_batch.capture import CaptureCamera, open_camera
 from bodycap_batch.config.calibration import max_rms_px
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.arrays import FloatArray, IntArray, evenly_spaced
@@ -26,6 +26,8 @@ _MIN_FOUND = 3
 chance. Evidence: none."""
 _MAX_SIDE_PX = 1280
 """Maximum long side (pixels) of the pictures in which squares are counted. Larger pictures are reduced."""
+_MAX_CLIP_PX = 8192
+"""Maximum long side (pixels) of the pictures in which corners are found: that of 8K videos."""
 _MIN_MARKERS = 4
 """Minimum number of markers in a picture that are used. Fewer can agree with a wrong numbering."""
 _MARKER_CORNERS = 0.35 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -88,8 +90,7 @@ def boards_in(video: Path, context: StageContext) -> list[FoundBoard]:
     Raises:
         CaptureError: The video cannot be used.
     """
-    config = CameraConfig(name="camera", video=(video,))
-    camera = open_camera(CaptureConfig(cameras=(config,), work_px=8192), config)
+    camera = open_clip(video)
     size = (camera.camera.width_px, camera.camera.height_px)
     frames = [int(frame) for frame in evenly_spaced(len(camera.times_ns), _PICTURES)]
     pictures = [image for _, image in camera.read(frames)]
@@ -109,6 +110,12 @@ def boards_in(video: Path, context: StageContext) -> list[FoundBoard]:
             corners = sum(len(view.px) for view in views)
             found.append(FoundBoard(board=board, corners=corners, rms_px=rms_px, is_usable=rms_px <= limit))
     return sorted(found, key=lambda each: (not each.is_usable, -each.corners))
+
+
+def open_clip(video: Path) -> CaptureCamera:
+    """Open the clip of a board at its full size. Raises `CaptureError` if it cannot be used."""
+    config = CameraConfig(name="camera", video=(video,))
+    return open_camera(CaptureConfig(cameras=(config,), work_px=_MAX_CLIP_PX), config)
 
 
 def _reduced(picture: GreyImage) -> GreyImage:

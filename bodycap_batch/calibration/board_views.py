@@ -40,14 +40,7 @@ def find_board_views(
         JobError: The board is not valid.
         CaptureError: A frame cannot be decoded.
     """
-    board = CalibrationBoard(
-        kind=marker_board.kind,
-        columns=marker_board.columns,
-        rows=marker_board.rows,
-        dictionary=marker_board.dictionary,
-        marker=marker_board.marker,
-        legacy=marker_board.legacy,
-    )
+    board = CalibrationBoard(**marker_board.model_dump(exclude={"square_m", "placed"}))
     out = []
     for camera, indices in sorted(frames.items()):
         for frame, image in capture.camera(camera).read(indices):

@@ -88,19 +88,15 @@ def write_preview(result: CalibrationResult, path: Path) -> None:
     Raises:
         StoreError: The file cannot be written.
     """
-    fit, (width, height) = result.fit, result.size
-    matrix, undistorted_matrix = fit.matrix, fit.matrix.copy()
+    fit, matrix, undistorted_matrix = result.fit, result.fit.matrix, result.fit.matrix.copy()
     if fit.model == "OPENCV_FISHEYE":
         # An undistorted picture of a fisheye lens's full view would be infinitely large. Only the middle of
         # the view is shown.
         undistorted_matrix[:2, :2] *= 0.6
-        maps = cv2.fisheye.initUndistortRectifyMap(
-            matrix, fit.distortion, np.eye(3), undistorted_matrix, (width, height), cv2.CV_32FC1
-        )
-    else:
-        maps = cv2.initUndistortRectifyMap(
-            matrix, fit.distortion, np.eye(3), undistorted_matrix, (width, height), cv2.CV_32FC1
-        )
+    module: Any = cv2.fisheye if fit.model == "OPENCV_FISHEYE" else cv2
+    maps = module.initUndistortRectifyMap(
+        matrix, fit.distortion, np.eye(3), undistorted_matrix, result.size, cv2.CV_32FC1
+    )
     flat = cv2.remap(result.preview, maps[0], maps[1], cv2.INTER_LINEAR)
     with atomic_replacement(path) as temporary:
         _, encoded = cv2.imencode(".png", np.hstack([result.preview, flat]))

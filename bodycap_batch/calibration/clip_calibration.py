@@ -12,15 +12,15 @@ import cv2
 import numpy as np
 
 from bodycap_batch.calibration.board_detection import BoardCorners, CalibrationBoard, GreyImage
-from bodycap_batch.calibration.board_search import boards_in
+from bodycap_batch.calibration.board_search import boards_in, open_clip
 from bodycap_batch.calibration.intrinsics_fit import ImageSize, IntrinsicsFit, fit_intrinsics
-from bodycap_batch.capture import CaptureCamera, open_camera
+from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.capture.lens_choice import VideoMode, video_mode
 from bodycap_batch.config.calibration import NOTED_RMS_RATIO, max_rms_px
-from bodycap_batch.config.models import CameraConfig, CaptureConfig
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import BodycapError, CaptureError, EstimationError
+from bodycap_batch.model.sharpness import sharpness
 
 CameraModelChoice = Literal["auto", "pinhole", "opencv", "fisheye"]
 _MODELS: dict[str, tuple[str, ...]] = {
@@ -122,10 +122,7 @@ def calibrate_clip(
         EstimationError: No camera model fits the views, or the fit is not usable: the error is too large, or
             the views do not agree on the focal length. If the clip shows another board, the error names it.
     """
-    camera = open_camera(
-        CaptureConfig(cameras=(CameraConfig(name="camera", video=(video,)),), work_px=8192),
-        CameraConfig(name="camera", video=(video,)),
-    )
+    camera = open_clip(video)
     size = (camera.camera.width_px, camera.camera.height_px)
     found: list[tuple[int, BoardCorners]] = []
     inspected = 0
@@ -192,10 +189,9 @@ def _sharpest_pictures(
         if frame >= end and best is not None:
             yield best[1], best[2]
             best, end = None, next(ends)[1]
-        small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        sharpness = float(cv2.Laplacian(small, cv2.CV_32F).var())
-        if best is None or sharpness > best[0]:
-            best = sharpness, frame, image
+        score = sharpness(image)
+        if best is None or score > best[0]:
+            best = score, frame, image
     if best is not None:
         yield best[1], best[2]
 
@@ -265,12 +261,9 @@ def corner_coverage(pixels: Sequence[FloatArray], size: ImageSize) -> float:
         pixels: (N,2) corners in each picture, px, OpenCV's pixel origin.
         size: Width and height of the pictures, px.
     """
-    cells = np.zeros(_COVERAGE_CELLS, dtype=bool)
-    for px in pixels:
-        cell = np.floor((px + 0.5) / np.array(size) * np.array(_COVERAGE_CELLS)).astype(int)
-        column, row = np.clip(cell, 0, np.array(_COVERAGE_CELLS) - 1).T
-        cells[column, row] = True
-    return float(cells.mean())
+    cells = np.array(_COVERAGE_CELLS)
+    cell = np.floor((np.concatenate(pixels) + 0.5) / np.array(size) * cells).astype(int)
+    return len(np.unique(np.clip(cell, 0, cells - 1), axis=0)) / float(cells.prod())
 
 
 def _notes(fit: IntrinsicsFit, size: ImageSize, coverage: float, mode: VideoMode) -> list[str]:

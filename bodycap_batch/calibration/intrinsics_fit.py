@@ -6,7 +6,7 @@ Pixels have OpenCV's origin: the centre of the first pixel is (0, 0).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -86,42 +86,19 @@ def fit_intrinsics(model: str, views: Sequence[BoardCorners], size: ImageSize) -
             _MAX_VIEW_ERROR_RATIO * float(np.median(errors)), _MIN_OUTLIER_ERROR_PX * max(size) / 640.0
         )
         good = [index for index, error in zip(kept, errors, strict=True) if error <= limit]
-        fit = _with_kept_views(fit, kept)
+        fit = replace(fit, kept=tuple(kept))
         if len(good) == len(kept) or len(good) < _MIN_FIT_VIEWS:
             return fit
         kept = good
     return fit
 
 
-def _with_kept_views(fit: IntrinsicsFit, kept: Sequence[int]) -> IntrinsicsFit:
-    """Return a copy of a fit in which `kept` holds the indices of the used views."""
-    return IntrinsicsFit(
-        model=fit.model,
-        matrix=fit.matrix,
-        distortion=fit.distortion,
-        rms_px=fit.rms_px,
-        view_rms_px=fit.view_rms_px,
-        focal_sigma_px=fit.focal_sigma_px,
-        kept=tuple(kept),
-    )
-
-
-def _opencv_points(views: Sequence[BoardCorners], *, fisheye: bool) -> tuple[list[Any], list[Any]]:
-    """Return the corners on the board and the corners in the picture, as lists with one array for each view.
-
-    OpenCV's fisheye functions need arrays (1,N,3) and (1,N,2) in double precision. OpenCV's other functions
-    need arrays (N,3) and (N,2) in single precision.
-    """
-    if fisheye:
-        return [view.board_m[None] for view in views], [view.px[None] for view in views]
-    return [view.board_m.astype(np.float32) for view in views], [view.px.astype(np.float32) for view in views]
-
-
 def _fit_pinhole(model: str, views: Sequence[BoardCorners], size: ImageSize) -> IntrinsicsFit | None:
     flags = cv2.CALIB_FIX_K3
     if model == "PINHOLE":
         flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_ZERO_TANGENT_DIST
-    on_board, px = _opencv_points(views, fisheye=False)
+    on_board = [view.board_m.astype(np.float32) for view in views]
+    px = [view.px.astype(np.float32) for view in views]
     try:
         rms, matrix, distortion, _, _, sigmas, _, view_errors = cv2.calibrateCameraExtended(
             on_board, px, size, None, None, flags=flags
@@ -157,13 +134,18 @@ def _fit_fisheye(views: Sequence[BoardCorners], size: ImageSize) -> IntrinsicsFi
 def _fit_fisheye_from(
     focal_px: float, views: Sequence[BoardCorners], size: ImageSize
 ) -> IntrinsicsFit | None:
-    on_board, px = _opencv_points(views, fisheye=True)
     matrix = np.array([[focal_px, 0, 0.5 * size[0] - 0.5], [0, focal_px, 0.5 * size[1] - 0.5], [0, 0, 1]])
     flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW | cv2.CALIB_USE_INTRINSIC_GUESS
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)
     try:
         _, matrix, distortion, rotations, translations = cv2.fisheye.calibrate(
-            on_board, px, size, matrix, np.zeros(4), flags=flags, criteria=criteria
+            [view.board_m[None] for view in views],  # OpenCV's fisheye functions need (1,N,3) and (1,N,2)
+            [view.px[None] for view in views],
+            size,
+            matrix,
+            np.zeros(4),
+            flags=flags,
+            criteria=criteria,
         )
     except cv2.error:
         return None

@@ -7,7 +7,6 @@ from bodycap_batch.evaluate.trajectories import (
     ErrorSummary,
     RelativeCameraError,
     TrajectoryReport,
-    evaluate_trajectories,
     relative_camera_error,
     score_trajectories,
 )
@@ -21,7 +20,6 @@ __all__ = [
     "RelativeCameraError",
     "TrajectoryReport",
     "evaluate_motion",
-    "evaluate_trajectories",
     "relative_camera_error",
     "score_motion",
     "score_trajectories",

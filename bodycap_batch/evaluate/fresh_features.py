@@ -14,6 +14,7 @@ import numpy.typing as npt
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX, Camera
 from bodycap_batch.model.optical_flow import unit_directions
+from bodycap_batch.model.rolling_shutter import row_delay
 
 _LONG_SIDE_PX = 800
 """Maximum long side (px) of the image in which features are detected. Origin: above it, detection takes
@@ -80,33 +81,30 @@ def detect_features(
     response = np.array([corner.response for corner in corners])
     kept = [corners[index] for index in _best_per_cell(cells, response, _FEATURES_PER_CELL)]
     described, descriptors = orb.compute(image, kept)
-    if not described:
-        nothing = np.zeros(0)
-        return FrameFeatures(
-            rays=np.zeros((0, 3)),
-            cells=nothing.astype(np.int64),
-            descriptors=np.zeros((0, 32), np.uint8),
-            pixel_rad=nothing,
-            row=nothing,
-        )
-    px = np.array([corner.pt for corner in described])
-    level = np.array([corner.octave for corner in described])
-    rays, usable = usable_rays(camera, (px + CV2_PIXEL_OFFSET_PX) / factor)
-    pixel_rad = 1.2**level / (factor * camera.focal_px)
-    return FrameFeatures(
-        rays=rays[usable],
-        cells=cells_of(px, (image.shape[1], image.shape[0]))[usable],
-        descriptors=descriptors[usable],
-        pixel_rad=pixel_rad[usable],
-        row=(px[:, 0] / image.shape[1] if camera.sideways else px[:, 1] / image.shape[0])[usable] - 0.5,
+    px = np.array([corner.pt for corner in described]).reshape(-1, 2)
+    level = np.array([corner.octave for corner in described], dtype=np.int64)
+    return features_at(
+        camera,
+        (px + CV2_PIXEL_OFFSET_PX) / factor,
+        np.zeros((0, 32), np.uint8) if descriptors is None else descriptors,
+        1.2**level / (factor * camera.focal_px),
     )
 
 
-def usable_rays(camera: Camera, px: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return the viewing rays (N,3) of pixels (N,2), and which of them are near enough to the axis (N,)."""
+def features_at(
+    camera: Camera, px: FloatArray, descriptors: npt.NDArray[np.integer], pixel_rad: FloatArray
+) -> FrameFeatures:
+    """Return the features of a frame at pixels (N,2). Those far from the optical axis are left out."""
     rays = unit_directions(camera.unproject(px))
     near = rays[:, 2] > np.cos(np.deg2rad(_MAX_AXIS_ANGLE_DEG))
-    return rays, np.asarray(np.isfinite(rays).all(axis=1) & near)
+    usable = np.isfinite(rays).all(axis=1) & near
+    return FrameFeatures(
+        rays=rays[usable],
+        cells=cells_of(px[usable], (camera.width_px, camera.height_px)),
+        descriptors=descriptors[usable],
+        pixel_rad=pixel_rad[usable],
+        row=row_delay(camera, px[usable]),
+    )
 
 
 def cells_of(px: FloatArray, size: tuple[int, int]) -> IntArray:

@@ -21,13 +21,12 @@ from bodycap_batch.evaluate.right_frames import (
     Pictures,
     RightFrames,
     find_right_frames,
-    has_pose,
     join_paths,
-    measure_pictures,
 )
 from bodycap_batch.evaluate.two_view import Outcome
 from bodycap_batch.formats.tum import TimedPoses, read_tum
 from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.geometry import poses_at
 from bodycap_batch.tracks import (
     find_fixed_regions,
     find_moving_regions,
@@ -159,7 +158,7 @@ def _check_camera(
     for number, path in enumerate(delivered.paths):
         poses = poses_of_frames(path, camera)
         show = partial(_show_part, progress, number, paths)
-        found.append(find_right_frames(measure_pictures(pictures, has_pose(poses), show), poses))
+        found.append(find_right_frames(pictures, poses, show))
     return join_paths(found)
 
 
@@ -200,16 +199,12 @@ def read_pictures(
 
 def poses_of_frames(poses: TimedPoses, camera: CaptureCamera) -> FloatArray:
     """Return the pose (N,4,4) of each of the N frames of a video; NaN for a frame without a pose."""
-    out = np.full((len(camera.times_ns), 4, 4), np.nan)
-    if len(poses.times_ns) == 0:
-        return out
-    after = np.clip(np.searchsorted(poses.times_ns, camera.times_ns), 0, len(poses.times_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    apart = np.abs(np.stack([poses.times_ns[before], poses.times_ns[after]]) - camera.times_ns)
-    nearest = np.where(apart[0] < apart[1], before, after)
-    interval = np.median(np.diff(camera.times_ns)) if len(camera.times_ns) > 1 else 1e9
-    has_pose = apart.min(axis=0) <= _TIME_TOLERANCE * interval
-    out[has_pose] = poses.world_from_cam[nearest[has_pose]]
+    interval_ns = np.median(np.diff(camera.times_ns)) if len(camera.times_ns) > 1 else 1e9
+    snap_ns = int(_TIME_TOLERANCE * interval_ns)
+    out, found = poses_at(
+        poses.times_ns, poses.world_from_cam, camera.times_ns, max_gap_ns=0, snap_ns=snap_ns
+    )
+    out[~found] = np.nan
     return out
 
 

@@ -204,22 +204,6 @@ class Pictures:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PictureEvidence:
-    """What the pictures of one camera measure. It depends only on which frames have a pose.
-
-    Attributes:
-        pictures: The features of all N frames.
-        pairs: The pairs of frames that are `GAPS` apart.
-        chains: Rotation last_from_first and its covariance across each stretch of frames without a pose, from
-            the rotations between the frames in it; None if it is not measurable.
-    """
-
-    pictures: Pictures
-    pairs: Mapping[tuple[int, int], MeasuredPair]
-    chains: Mapping[tuple[int, int], tuple[FloatArray, FloatArray] | None]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RightFrames:
     """The outcome for one camera.
 
@@ -255,34 +239,6 @@ def join_paths(paths: Sequence[RightFrames]) -> RightFrames:
         links=sum((Counter(path.links) for path in paths), Counter[Outcome]()),
         legs={frames: outcome for path in paths for frames, outcome in path.legs.items()},
     )
-
-
-def measure_pictures(
-    pictures: Pictures,
-    posed: BoolArray,
-    progress: Callable[[int, int], None] | None = None,
-    gaps: Mapping[int, int] = GAPS,
-) -> PictureEvidence:
-    """Match the frames of one camera with each other.
-
-    Args:
-        pictures: The features of all N frames.
-        posed: (N,) True for frames with a delivered pose.
-        progress: Receives the number of finished frames and of all frames.
-        gaps: Distances in frames of the linked frames, and every how many frames a link starts.
-    """
-    pairs: dict[tuple[int, int], MeasuredPair] = {}
-    for first in range(len(posed)):
-        if progress is not None:
-            progress(first, len(posed))
-        for gap, every in gaps.items():
-            second = first + gap
-            if first % every == 0 and second < len(posed) and posed[first] and posed[second]:
-                pairs[first, second] = pictures.pair(first, second)
-    ends = np.flatnonzero(posed)
-    stretches = [(int(a), int(b)) for a, b in pairwise(ends) if b - a > 1]
-    chains = {ends: _chain(pictures, *ends) for ends in stretches}
-    return PictureEvidence(pictures=pictures, pairs=pairs, chains=chains)
 
 
 def _at_middle_row(
@@ -325,45 +281,60 @@ def _ray_matches(first: FrameFeatures, second: FrameFeatures, rows: IntArray) ->
     )
 
 
-def _judge_pair(
-    features: Features, frames: tuple[int, int], pair: MeasuredPair, world_from_cam: FloatArray
-) -> Outcome:
+def _judge_pair(pictures: Pictures, frames: tuple[int, int], world_from_cam: FloatArray) -> Outcome:
     """Compare the delivered rotation between two frames with their matches, as `judge_rotation` does."""
-    first, second = features[frames[0]], features[frames[1]]
+    pair = pictures.pair(*frames)
+    first, second = pictures.features[frames[0]], pictures.features[frames[1]]
     if first is None or second is None:
         return Outcome.UNMEASURABLE
     expected = world_from_cam[frames[1], :3, :3].T @ world_from_cam[frames[0], :3, :3]
     return judge_rotation(_ray_matches(first, second, pair.rows), pair.measured, expected)
 
 
-def find_right_frames(evidence: PictureEvidence, world_from_cam: FloatArray) -> RightFrames:
+def _judge_chain(pictures: Pictures, frames: tuple[int, int], world_from_cam: FloatArray) -> Outcome:
+    """Compare the delivered rotation across lost frames with the rotations between them, or with tracks."""
+    chain, by_tracks = _chain(pictures, *frames), pictures.rotation_chain
+    rotations = world_from_cam[list(frames), :3, :3]
+    if chain is not None:
+        return Outcome.WRONG if differs(*chain, rotations[1].T @ rotations[0]) else Outcome.RIGHT
+    if by_tracks is not None and by_tracks.confirms(np.array(frames), rotations) is False:
+        return Outcome.WRONG
+    return Outcome.UNMEASURABLE
+
+
+def find_right_frames(
+    pictures: Pictures,
+    world_from_cam: FloatArray,
+    progress: Callable[[int, int], None] | None = None,
+    gaps: Mapping[int, int] = GAPS,
+) -> RightFrames:
     """Compare the delivered poses of one camera with its pictures.
 
     Args:
-        evidence: What the pictures measure.
+        pictures: The features of all N frames.
         world_from_cam: (N,4,4) delivered poses; NaN for a frame without one.
+        progress: Receives the number of finished frames and of all frames.
+        gaps: Distances in frames of the linked frames, and every how many frames a link starts.
     """
-    posed, features = has_pose(world_from_cam), evidence.pictures.features
-    outcomes: dict[tuple[int, int], Outcome] = {}
-    for (first, second), pair in evidence.pairs.items():
-        outcomes[first, second] = _judge_pair(features, (first, second), pair, world_from_cam)
-    for (first, last), chain in evidence.chains.items():
-        expected = world_from_cam[last, :3, :3].T @ world_from_cam[first, :3, :3]
-        by_tracks, ends = evidence.pictures.rotation_chain, np.array([first, last])
-        if chain is not None:
-            outcomes[first, last] = Outcome.WRONG if differs(*chain, expected) else Outcome.RIGHT
-        elif by_tracks is not None and by_tracks.confirms(ends, world_from_cam[ends, :3, :3]) is False:
-            outcomes[first, last] = Outcome.WRONG
-        else:
-            outcomes[first, last] = Outcome.UNMEASURABLE
-    outcomes |= _revisits(evidence.pictures, world_from_cam, posed)
-    legs = _position_outcomes(evidence, world_from_cam)
+    posed = has_pose(world_from_cam)
+    count, links_of = len(posed), dict[tuple[int, int], Outcome]()
+    for first in range(count):
+        if progress is not None:
+            progress(first, count)
+        for gap, every in gaps.items():
+            second = first + gap
+            if first % every == 0 and second < count and posed[first] and posed[second]:
+                links_of[first, second] = _judge_pair(pictures, (first, second), world_from_cam)
+    ends = pairwise(np.flatnonzero(posed).tolist())
+    chains_of = {(a, b): _judge_chain(pictures, (a, b), world_from_cam) for a, b in ends if b - a > 1}
+    legs = _position_outcomes(pictures, list(links_of), world_from_cam)
+    outcomes = links_of | chains_of
+    outcomes |= _revisits(pictures, world_from_cam, posed)
     spans: dict[Outcome, list[tuple[int, int]]] = defaultdict(list)
     for frames, (outcome, _) in legs.items():
         spans[outcome].append((frames[0], frames[2]))
-    count = len(posed)
     links = {each: [pair for pair, found in outcomes.items() if found is each] for each in Outcome}
-    chains = {each: [pair for pair in evidence.chains if outcomes[pair] is each] for each in Outcome}
+    chains = {each: [pair for pair in chains_of if outcomes[pair] is each] for each in Outcome}
     across = {each: links[each] + chains[each] for each in Outcome}
     folds = contradicted_times(across[Outcome.WRONG], across[Outcome.RIGHT], count, _MIN_WRONG_LINKS)
     unexplained = [span for span in spans[Outcome.WRONG] if not _spans(span, folds)]
@@ -391,13 +362,14 @@ def has_pose(world_from_cam: FloatArray) -> BoolArray:
 
 
 def _position_outcomes(
-    evidence: PictureEvidence, world_from_cam: FloatArray
+    pictures: Pictures, pairs: Sequence[tuple[int, int]], world_from_cam: FloatArray
 ) -> dict[tuple[int, int, int], tuple[Outcome, Legs | None]]:
     """Compare the positions of each three frames at equal distances."""
     found: dict[tuple[int, int, int], tuple[Outcome, Legs | None]] = {}
-    for first, second in evidence.pairs:
+    linked = set(pairs)
+    for first, second in pairs:
         frames = (first, second, 2 * second - first)
-        triple = evidence.pictures.triple(frames) if frames[1:] in evidence.pairs else None
+        triple = pictures.triple(frames) if frames[1:] in linked else None
         if triple is None:
             continue
         poses = world_from_cam[list(frames)]
@@ -476,7 +448,7 @@ def _revisits(
         for other in np.argsort(distance, kind="stable")[: min(_REVISITS, np.count_nonzero(is_similar))]:
             first = int(frames[other])
             ends = (first, int(second))
-            outcomes[ends] = _judge_pair(pictures.features, ends, pictures.pair(*ends), world_from_cam)
+            outcomes[ends] = _judge_pair(pictures, ends, world_from_cam)
     return outcomes
 
 

@@ -14,13 +14,11 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.evaluate.fresh_features import FrameFeatures, cells_of, usable_rays
+from bodycap_batch.evaluate.fresh_features import FrameFeatures, features_at
 from bodycap_batch.evaluate.right_frames import (
     Pictures,
     RightFrames,
     find_right_frames,
-    has_pose,
-    measure_pictures,
 )
 from bodycap_batch.evaluate.two_view import Outcome
 from bodycap_batch.model.camera import Camera
@@ -73,8 +71,7 @@ def check_with_tracks(
         rotations=world_from_cam[:, :3, :3],
         match=_common_tracks,
     )
-    evidence = measure_pictures(pictures, has_pose(world_from_cam), progress, _GAPS)
-    return find_right_frames(evidence, world_from_cam)
+    return find_right_frames(pictures, world_from_cam, progress, _GAPS)
 
 
 def count_frames(found: RightFrames) -> dict[str, Any]:
@@ -108,17 +105,8 @@ def _features(tracks: PointTracks, lens: Camera, frame: int) -> FrameFeatures | 
     numbers, position = tracks.at(frame)
     if len(numbers) == 0:
         return None
-    px = position.astype(np.float64)
-    rays, usable = usable_rays(lens, px)
     error_rad = _ERROR_PX * pixel_scale(lens.width_px, lens.height_px) / lens.focal_px
-    along = px[:, 0] / lens.width_px if lens.sideways else px[:, 1] / lens.height_px
-    return FrameFeatures(
-        rays=rays[usable],
-        cells=cells_of(px, (lens.width_px, lens.height_px))[usable],
-        descriptors=numbers[usable],
-        pixel_rad=np.full(np.count_nonzero(usable), error_rad),
-        row=along[usable] - 0.5,
-    )
+    return features_at(lens, position.astype(np.float64), numbers, np.full(len(numbers), error_rad))
 
 
 def _common_tracks(first: FrameFeatures, second: FrameFeatures) -> IntArray:

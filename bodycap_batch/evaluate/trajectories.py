@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.formats.tum import TimedPoses, read_tum
+from bodycap_batch.formats.tum import TimedPoses
 from bodycap_batch.model.geometry import (
     Similarity,
     align_points,
@@ -135,32 +134,6 @@ class TrajectoryReport:
         }
 
 
-def evaluate_trajectories(
-    estimates: Mapping[str, Path],
-    truths: Mapping[str, Path],
-    align: Alignment = "sim3",
-    frames: Mapping[str, int] | None = None,
-) -> TrajectoryReport:
-    """Compare estimated trajectories with true trajectories, given as TUM files.
-
-    Args:
-        estimates: Files of estimated poses world_from_camera in one gauge for all cameras, by camera name.
-        truths: Files of true poses world_from_camera, by camera name. Every camera in `estimates` needs a
-            file.
-        align: Kind of the alignment.
-        frames: Number of frames of each camera's video, by camera name, for the coverage.
-
-    Raises:
-        JobError: A file is missing or malformed, or too few poses have a true pose.
-    """
-    return score_trajectories(
-        {name: read_tum(path) for name, path in estimates.items()},
-        {name: read_tum(path) for name, path in truths.items()},
-        align,
-        frames,
-    )
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _MatchedPoses:
     """The N estimated poses of one camera that have a true pose.
@@ -188,7 +161,14 @@ def score_trajectories(
 ) -> TrajectoryReport:
     """Compare estimated poses with true poses.
 
-    The arguments are the same as in `evaluate_trajectories`, with poses instead of files.
+    Args:
+        estimates: Estimated poses world_from_camera in one gauge for all cameras, by camera name.
+        truths: True poses world_from_camera, by camera name. Every camera in `estimates` needs some.
+        align: Kind of the alignment.
+        frames: Number of frames of each camera's video, by camera name, for the coverage.
+
+    Raises:
+        JobError: A camera has no true path, or too few poses have a true pose.
 
     Source: S. Umeyama, PAMI 1991 (alignment); J. Sturm et al., "A benchmark for the evaluation of RGB-D
         SLAM systems", IROS 2012 (ATE and RPE).

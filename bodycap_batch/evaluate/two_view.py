@@ -7,7 +7,7 @@ from enum import StrEnum
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.model.geometry import rotation_angle_rad, so3_log
+from bodycap_batch.model.geometry import so3_log
 from bodycap_batch.tracks.relative_motion import Motion, RayMatches, refine_motion, usable
 
 WRONG_DEG = 5.0
@@ -64,8 +64,3 @@ def differs(measured: FloatArray, covariance: FloatArray, expected: FloatArray) 
     if np.linalg.norm(difference) <= np.deg2rad(WRONG_DEG):
         return False
     return bool(difference @ np.linalg.solve(covariance, difference) > SIGMAS**2)
-
-
-def angle_deg(first: FloatArray, second: FloatArray) -> float:
-    """Return the angle between two rotations, degrees."""
-    return float(np.rad2deg(rotation_angle_rad(first.T @ second)))

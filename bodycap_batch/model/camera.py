@@ -19,44 +19,28 @@ CV2_PIXEL_OFFSET_PX = 0.5
 """Offset, pixels, that is added to OpenCV's pixel coordinates to get COLMAP's pixel coordinates. In OpenCV,
 the centre of the first pixel is at (0, 0)."""
 
-_FOCAL_INDICES = {
-    "SIMPLE_PINHOLE": (0,),
-    "PINHOLE": (0, 1),
-    "SIMPLE_RADIAL": (0,),
-    "RADIAL": (0,),
-    "OPENCV": (0, 1),
-    "FULL_OPENCV": (0, 1),
-    "OPENCV_FISHEYE": (0, 1),
-    "SIMPLE_RADIAL_FISHEYE": (0,),
-    "RADIAL_FISHEYE": (0,),
-    "THIN_PRISM_FISHEYE": (0, 1),
-    "FOV": (0, 1),
-    "EUCM": (0, 1),
+_MODELS = {
+    "SIMPLE_PINHOLE": (1, 3),
+    "PINHOLE": (2, 4),
+    "SIMPLE_RADIAL": (1, 4),
+    "RADIAL": (1, 5),
+    "OPENCV": (2, 8),
+    "FULL_OPENCV": (2, 12),
+    "OPENCV_FISHEYE": (2, 8),
+    "SIMPLE_RADIAL_FISHEYE": (1, 4),
+    "RADIAL_FISHEYE": (1, 5),
+    "THIN_PRISM_FISHEYE": (2, 12),
+    "FOV": (2, 5),
+    "EUCM": (2, 6),
 }
-"""Indices of the focal lengths among the parameters of each COLMAP camera model. Source: COLMAP,
-sensor/models.h."""
-
-_PARAM_COUNT = {
-    "SIMPLE_PINHOLE": 3,
-    "PINHOLE": 4,
-    "SIMPLE_RADIAL": 4,
-    "RADIAL": 5,
-    "OPENCV": 8,
-    "FULL_OPENCV": 12,
-    "OPENCV_FISHEYE": 8,
-    "SIMPLE_RADIAL_FISHEYE": 4,
-    "RADIAL_FISHEYE": 5,
-    "THIN_PRISM_FISHEYE": 12,
-    "FOV": 5,
-    "EUCM": 6,
-}
-"""Number of parameters of each COLMAP camera model. Source: COLMAP, sensor/models.h."""
+"""Numbers of focal lengths and of all parameters of each COLMAP camera model. The focal lengths come first,
+then the principal point. Source: COLMAP, sensor/models.h."""
 
 _MIN_DEPTH = 1e-9
 """Minimum depth, in the unit of the points, of a point that is projected to the image. Derivation: the limit
 avoids a division by zero."""
 
-CAMERA_MODELS = tuple(_PARAM_COUNT)
+CAMERA_MODELS = tuple(_MODELS)
 
 
 def parameter_count(model: str) -> int:
@@ -65,12 +49,12 @@ def parameter_count(model: str) -> int:
     Raises:
         KeyError: The model is unknown.
     """
-    return _PARAM_COUNT[model]
+    return _MODELS[model][1]
 
 
 def focal_count(model: str) -> int:
     """Return the number of focal lengths, 1 or 2, of a COLMAP camera model."""
-    return len(_FOCAL_INDICES[model])
+    return _MODELS[model][0]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,27 +79,26 @@ class Camera:
     sideways: bool = False
 
     def __post_init__(self) -> None:
-        if self.model not in _PARAM_COUNT:
+        if self.model not in _MODELS:
             raise ValueError(f"unknown camera model {self.model!r}; known: {', '.join(CAMERA_MODELS)}")
-        set_array(self, "params", (_PARAM_COUNT[self.model],))
+        set_array(self, "params", (parameter_count(self.model),))
         if self.width_px <= 0 or self.height_px <= 0 or self.focal_px <= 0:
             raise ValueError("image size and focal length must be positive")
 
     @property
     def focal_px(self) -> float:
         """Focal length in pixels; the mean of the two axes if the model has two focal lengths."""
-        return float(np.mean([self.params[i] for i in _FOCAL_INDICES[self.model]]))
+        return float(np.mean(self.params[: focal_count(self.model)]))
 
     @property
     def focal_ratio(self) -> float:
         """Ratio of the focal length along x to that along y; 1 if the model has one focal length."""
-        focal = _FOCAL_INDICES[self.model]
-        return float(self.params[focal[0]] / self.params[focal[-1]])
+        return float(self.params[0] / self.params[focal_count(self.model) - 1])
 
     @property
     def principal_point_px(self) -> tuple[float, float]:
         """Principal point (cx, cy) in pixels."""
-        first = len(_FOCAL_INDICES[self.model])
+        first = focal_count(self.model)
         return float(self.params[first]), float(self.params[first + 1])
 
     def to_pycolmap(self) -> pycolmap.Camera:
@@ -166,14 +149,9 @@ class Camera:
         """
         scale_x, scale_y = width_px / self.width_px, height_px / self.height_px
         params = self.params.copy()
-        focal = _FOCAL_INDICES[self.model]
-        if len(focal) == 1:
-            params[0] *= 0.5 * (scale_x + scale_y)
-        else:
-            params[0] *= scale_x
-            params[1] *= scale_y
-        params[len(focal)] *= scale_x
-        params[len(focal) + 1] *= scale_y
+        count = focal_count(self.model)
+        params[:count] *= 0.5 * (scale_x + scale_y) if count == 1 else (scale_x, scale_y)
+        params[count : count + 2] *= scale_x, scale_y
         return replace(self, width_px=width_px, height_px=height_px, params=params)
 
 
@@ -198,7 +176,7 @@ def with_two_focal_lengths(camera: Camera) -> Camera:
         return camera
     model, distortion_count = _TWO_FOCAL_MODEL[camera.model]
     focal, cx, cy, *distortion = camera.params
-    params = np.zeros(_PARAM_COUNT[model])
+    params = np.zeros(parameter_count(model))
     params[:4] = focal, focal, cx, cy
     params[4 : 4 + distortion_count] = distortion[:distortion_count]
     return replace(camera, model=model, params=params)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -128,18 +128,3 @@ class GyroRates:
         step_s = (times_s - self.times_s[before])[:, None]
         mean = 0.5 * (self.rate_rad_s[before] + self._rate(times_s))
         return np.asarray(total[before] + mean * step_s)
-
-    def turned(self, cam_from_samples: FloatArray, delay_s: float, bias_rad_s: FloatArray) -> GyroRates:
-        """Return the angular velocities after a correction of their relation to the camera.
-
-        Args:
-            cam_from_samples: (3,3) rotation from the present axes to the better axes of the camera.
-            delay_s: Present time of the samples = better time + delay, seconds.
-            bias_rad_s: (3,) remaining bias in the present axes, rad/s.
-        """
-        return replace(
-            self,
-            times_s=self.times_s - delay_s,
-            rate_rad_s=(self.rate_rad_s - bias_rad_s) @ cam_from_samples.T,
-            gaps_s=self.gaps_s - delay_s,
-        )

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-_UNDECIDED_GROUPS = "mirror_images"
-_FLIPPED_CAMERAS = "mirrored_cameras"
-_INITIAL_PAIR = "named_initial_pair"
-_EXCLUDED_FROM_PAIR = "left_out"
-_CONTRADICTING_CAMERAS = "contradicting_cameras"
-_MISFIT_FACTORS = "misfitting_lenses"
-_RECALIBRATED = "freed_lenses"
-_REFINED_INTRINSICS = "found_lenses"
-_EXTENSIONS = "growth"
-_REACH = "reach"
-_MISPLACED = "misplaced_keyframes"
-_UNKNOWN_SHUTTERS = "unknown_shutters"
-_DISTORTED_CAMERAS = "distorted_cameras"
+_KEYS = {
+    "undecided_groups": "mirror_images",
+    "flipped_cameras": "mirrored_cameras",
+    "contradicting_cameras": "contradicting_cameras",
+    "recalibrated": "freed_lenses",
+    "unknown_shutters": "unknown_shutters",
+    "excluded_from_pair": "named_initial_pair",
+    "misfit_factors": "misfitting_lenses",
+    "refined_intrinsics": "found_lenses",
+    "extensions": "growth",
+    "reach": "reach",
+    "misplaced": "misplaced_keyframes",
+    "distorted_cameras": "distorted_cameras",
+}
+"""Key in the log of each field, in the order in which they are written."""
+_LEFT_OUT = "left_out"
+"""Key of the names in the entry of `excluded_from_pair`."""
+_CHECKED = ("misfit_factors", "reach")
+"""Fields that are None without a check, and empty if the check found nothing."""
+_REFINED = ("misplaced", "distorted_cameras")
+"""Fields whose entry an earlier refinement may have written. It is replaced by an empty one."""
 
 CameraGroups = tuple[tuple[str, ...], tuple[str, ...]]
 """Two groups of cameras, by name."""
@@ -87,24 +95,17 @@ class MapDiagnostics:
         Args:
             log: The log that is stored with the map, or the value of ``mapping`` in ``metrics.json``.
         """
-        return MapDiagnostics(
-            undecided_groups=tuple(_groups(groups) for groups in log.get(_UNDECIDED_GROUPS, ())),
-            flipped_cameras=tuple(log.get(_FLIPPED_CAMERAS, ())),
-            contradicting_cameras=tuple(log.get(_CONTRADICTING_CAMERAS, ())),
-            excluded_from_pair=tuple(log.get(_INITIAL_PAIR, {}).get(_EXCLUDED_FROM_PAIR, ())),
-            misfit_factors=log.get(_MISFIT_FACTORS),
-            recalibrated=tuple(log.get(_RECALIBRATED, ())),
-            refined_intrinsics={
+        found = {name: _as_tuples(log[key]) for name, key in _KEYS.items() if key in log}
+        if "excluded_from_pair" in found:
+            found["excluded_from_pair"] = _as_tuples(found["excluded_from_pair"].get(_LEFT_OUT, ()))
+        if "misplaced" in found:
+            found["misplaced"] = {name: tuple(frames) for name, frames in found["misplaced"].items()}
+        if "refined_intrinsics" in found:
+            found["refined_intrinsics"] = {
                 name: RefinedIntrinsics(entry["model"], tuple(entry["params"]))
-                for name, entry in log.get(_REFINED_INTRINSICS, {}).items()
-            },
-            extensions=tuple(log.get(_EXTENSIONS, ())),
-            reach=log.get(_REACH),
-            misplaced={name: tuple(frames) for name, frames in log.get(_MISPLACED, {}).items()},
-            unknown_shutters=tuple(log.get(_UNKNOWN_SHUTTERS, ())),
-            distorted_cameras=tuple(log.get(_DISTORTED_CAMERAS, ())),
-            details=log,
-        )
+                for name, entry in found["refined_intrinsics"].items()
+            }
+        return MapDiagnostics(**found, details=log)
 
     def to_log(self) -> dict[str, Any]:
         """Return the log.
@@ -113,40 +114,26 @@ class MapDiagnostics:
         or replaced.
         """
         log = dict(self.details)
-        if self.undecided_groups:
-            log[_UNDECIDED_GROUPS] = [[list(one), list(other)] for one, other in self.undecided_groups]
-        for key, names in (
-            (_FLIPPED_CAMERAS, self.flipped_cameras),
-            (_CONTRADICTING_CAMERAS, self.contradicting_cameras),
-            (_RECALIBRATED, self.recalibrated),
-            (_UNKNOWN_SHUTTERS, self.unknown_shutters),
-        ):
-            if names:
-                log[key] = list(names)
+        for name, key in _KEYS.items():
+            value = getattr(self, name)
+            is_known = value is not None if name in _CHECKED else bool(value)
+            if is_known or (name in _REFINED and key in log):
+                log[key] = _as_lists(value)
         if self.excluded_from_pair:
-            log[_INITIAL_PAIR] = {
+            log[_KEYS["excluded_from_pair"]] = {
                 "failed": "a mirrored camera was left out",
-                _EXCLUDED_FROM_PAIR: list(self.excluded_from_pair),
+                _LEFT_OUT: list(self.excluded_from_pair),
             }
-        if self.misfit_factors is not None:
-            log[_MISFIT_FACTORS] = dict(self.misfit_factors)
-        if self.refined_intrinsics:
-            log[_REFINED_INTRINSICS] = {
-                name: {"model": item.model, "params": list(item.params)}
-                for name, item in self.refined_intrinsics.items()
-            }
-        if self.extensions:
-            log[_EXTENSIONS] = list(self.extensions)
-        if self.reach is not None:
-            log[_REACH] = dict(self.reach)
-        if self.misplaced or _MISPLACED in log:
-            log[_MISPLACED] = {name: list(frames) for name, frames in self.misplaced.items()}
-        if self.distorted_cameras or _DISTORTED_CAMERAS in log:
-            log[_DISTORTED_CAMERAS] = list(self.distorted_cameras)
         return log
 
 
-def _groups(groups: Sequence[Sequence[str]]) -> CameraGroups:
-    """Convert a pair of lists of camera names to a pair of tuples."""
-    one, other = groups
-    return tuple(one), tuple(other)
+def _as_tuples(value: Any) -> Any:
+    return tuple(map(_as_tuples, value)) if isinstance(value, list) else value
+
+
+def _as_lists(value: Any) -> Any:
+    if isinstance(value, RefinedIntrinsics):
+        return {"model": value.model, "params": list(value.params)}
+    if isinstance(value, Mapping):
+        return {name: _as_lists(part) for name, part in value.items()}
+    return [_as_lists(part) for part in value] if isinstance(value, tuple) else value

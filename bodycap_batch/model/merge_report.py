@@ -95,12 +95,12 @@ class ScaleReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TPoseReport:
-    """The start and the end of a T-pose, seconds after tick 0.
+class SpanReport:
+    """The start and the end of a part of the motion.
 
     Attributes:
-        from_s: Start of the T-pose, seconds after tick 0.
-        to_s: End of the T-pose, seconds after tick 0.
+        from_s: Start of the part, seconds after tick 0.
+        to_s: End of the part, seconds after tick 0.
     """
 
     from_s: float
@@ -224,19 +224,6 @@ class CameraReport:
     residual_m: Percentiles
     residual_deg: Percentiles
     longest_gap_s: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StillPartReport:
-    """The time in which a camera on a limb stands still in the room while the trunk moves.
-
-    Attributes:
-        from_s: Start of the first such part, seconds from the start of the motion.
-        to_s: End of the last such part, seconds from the start of the motion.
-    """
-
-    from_s: float
-    to_s: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -399,7 +386,7 @@ class MergeReport:
     """
 
     scale: ScaleReport
-    t_pose: TPoseReport | None
+    t_pose: SpanReport | None
     up: VerticalReport
     floor: FloorReport
     mounts: Mapping[str, MountReport]
@@ -407,7 +394,7 @@ class MergeReport:
     exchanged_sides: SwappedSidesReport | None = field(metadata=_EMPTY_IF_NONE)
     inverted_cameras: InvertedCamerasReport | None = field(default=None, metadata=_OMIT_NONE)
     slipped_mounts: SlippedMountsReport | None = field(default=None, metadata=_OMIT_NONE)
-    still_cameras: Mapping[str, StillPartReport]
+    still_cameras: Mapping[str, SpanReport]
     unused_cameras: Mapping[str, str]
     joined_cameras: Mapping[str, AlignedCameraReport]
     joint_gap_m: Mapping[str, Percentiles]

@@ -130,7 +130,7 @@ def camera_reach(skeleton: SkeletonModel, mounts: Sequence[Mount]) -> list[tuple
     rest = rest_positions(skeleton)
     rows = []
     for first, second in combinations(sorted(mounts, key=lambda mount: mount.camera), 2):
-        paths = [_joints_to_root(skeleton, mount) for mount in (first, second)]
+        paths = [skeleton.path_to_root(skeleton.roles.index(mount.role)) for mount in (first, second)]
         shared = set(paths[0]) & set(paths[1])
         ends = [
             rest[path[0]] + mount.joint_from_cam[:3, 3]
@@ -152,14 +152,6 @@ def camera_reach(skeleton: SkeletonModel, mounts: Sequence[Mount]) -> list[tuple
         high = (1 + _REACH_MARGIN_RATIO) * most + _REACH_MARGIN_M
         rows.append((first.camera, second.camera, round(low, 2), round(high, 2)))
     return rows
-
-
-def _joints_to_root(skeleton: SkeletonModel, mount: Mount) -> list[int]:
-    """Return the index of the joint that a camera is mounted on, followed by its ancestors up to the root."""
-    path = [skeleton.roles.index(mount.role)]
-    while skeleton.parents[path[-1]] >= 0:
-        path.append(int(skeleton.parents[path[-1]]))
-    return path
 
 
 def _is_articulated(skeleton: SkeletonModel, joint: int) -> bool:

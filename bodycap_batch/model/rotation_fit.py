@@ -9,7 +9,7 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.frame_matches import FrameMatches
-from bodycap_batch.model.geometry import so3_exp, so3_log
+from bodycap_batch.model.geometry import nearest_rotation, skew, so3_exp, so3_log
 from bodycap_batch.model.optical_flow import pixel_scale, unit_directions
 from bodycap_batch.model.rolling_shutter import row_delay
 from bodycap_batch.model.rotation_path import RotationPath
@@ -230,9 +230,9 @@ def _with_rates(path: RotationPath, rays: MatchedRays, readout_s: float) -> Rota
     ]
     jacobian = np.concatenate(
         [
-            _skew(turned),
-            leverage[0] * np.einsum("pij,pkjl->pkil", step, _skew(first)),
-            -leverage[1] * _skew(second),
+            skew(turned),
+            leverage[0] * np.einsum("pij,pkjl->pkil", step, skew(first)),
+            -leverage[1] * skew(second),
         ],
         axis=3,
     )
@@ -289,14 +289,6 @@ def _solve_chain(
         for column in range(row + 1):
             banded[row - column, column : 3 * (count - 1) + column : 3] += normal[:, row, column]
     return np.asarray(solveh_banded(banded, vector.ravel(), lower=True)).reshape(count, 3)
-
-
-def _skew(vector: FloatArray) -> FloatArray:
-    """Return the cross-product matrices (...,3,3) of vectors (...,3)."""
-    zero = np.zeros(vector.shape[:-1])
-    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _is_known(inlier: BoolArray, rays: MatchedRays) -> BoolArray:
@@ -379,7 +371,7 @@ def _refine_rotations(
     for _ in range(_WEIGHT_ROUNDS):
         error = np.linalg.norm(first @ np.swapaxes(rotation, 1, 2) - second, axis=2)
         weight = _weights(error, rays)
-        rotation = _nearest_rotations(np.swapaxes(second * weight[:, :, None], 1, 2) @ first)
+        rotation = nearest_rotation(np.swapaxes(second * weight[:, :, None], 1, 2) @ first)
     error = np.linalg.norm(first @ np.swapaxes(rotation, 1, 2) - second, axis=2)
     return rotation, np.asarray(rays.used & (error < _INLIER_SCALE * rays.noise_rad))
 
@@ -395,10 +387,3 @@ def _weights(error: FloatArray, rays: MatchedRays) -> FloatArray:
     median = ordered[np.arange(len(error)), middle]
     scale = np.clip(median, low, high)[:, None]
     return np.asarray(rays.used / (scale**2 + error**2))
-
-
-def _nearest_rotations(matrix: FloatArray) -> FloatArray:
-    """Return the rotations (P,3,3) that are nearest to matrices (P,3,3)."""
-    u, _, vt = np.linalg.svd(matrix)
-    u[:, :, 2] *= np.where(np.linalg.det(u @ vt) < 0.0, -1.0, 1.0)[:, None]
-    return np.asarray(u @ vt)

@@ -74,6 +74,13 @@ class SkeletonModel:
         """Return the index of the joint with this anatomical role; None if no joint has this role."""
         return self.roles.index(role) if role in self.roles else None
 
+    def path_to_root(self, joint: int) -> list[int]:
+        """Return the index of a joint, followed by its ancestors up to the root."""
+        path = [joint]
+        while self.parents[path[-1]] >= 0:
+            path.append(int(self.parents[path[-1]]))
+        return path
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MountSlip:
@@ -110,8 +117,7 @@ class MountSlip:
         Returns:
             (N,4,4) poses; those before the slip remain unchanged.
         """
-        after = (times_ns >= self.time_ns)[:, None, None]
-        return np.asarray(np.where(after, poses @ invert(self.before_from_after), poses))
+        return self._stepped(poses, times_ns, invert(self.before_from_after))
 
     def as_moved(self, poses: FloatArray, times_ns: IntArray) -> FloatArray:
         """Return the inverse of `as_before`: from the place before the slip to the actual place.
@@ -123,8 +129,11 @@ class MountSlip:
         Returns:
             (N,4,4) poses of the camera.
         """
+        return self._stepped(poses, times_ns, self.before_from_after)
+
+    def _stepped(self, poses: FloatArray, times_ns: IntArray, step: FloatArray) -> FloatArray:
         after = (times_ns >= self.time_ns)[:, None, None]
-        return np.asarray(np.where(after, poses @ self.before_from_after, poses))
+        return np.asarray(np.where(after, poses @ step, poses))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -340,10 +349,7 @@ def with_outer_joints(motion: Motion) -> Motion:
 
 def _from_root(skeleton: SkeletonModel, joint: int) -> FloatArray:
     """Return the position (3,) of a joint in the frame of the root in the zero pose, metres."""
-    out = np.zeros(3)
-    while joint > 0:
-        out, joint = out + skeleton.offsets_m[joint], int(skeleton.parents[joint])
-    return out
+    return np.asarray(skeleton.offsets_m[skeleton.path_to_root(joint)[:-1]].sum(axis=0))
 
 
 def _chain_poses(skeleton: SkeletonModel, parent_from_joint: FloatArray) -> FloatArray:

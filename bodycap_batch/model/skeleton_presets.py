@@ -172,17 +172,10 @@ def bone_vector(skeleton: SkeletonModel, role: str) -> FloatArray | None:
     if following is not None:
         vector = rest[following] - rest[joint]
         return np.asarray(vector) if np.linalg.norm(vector) > _MIN_BONE_M else None
-    subtree = [index for index in range(len(rest)) if _is_descendant(skeleton, index, joint)]
+    subtree = [index for index in range(len(rest)) if joint in skeleton.path_to_root(index)]
     tips = np.array([rest[i] + np.nan_to_num(skeleton.end_offsets_m[i]) - rest[joint] for i in subtree])
     farthest = tips[np.argmax(np.linalg.norm(tips, axis=1))]
     return np.asarray(farthest) if np.linalg.norm(farthest) > _MIN_BONE_M else None
-
-
-def _is_descendant(skeleton: SkeletonModel, joint: int, ancestor: int) -> bool:
-    """Return True if `joint` is `ancestor` or one of the descendants of `ancestor`."""
-    while joint > ancestor:
-        joint = int(skeleton.parents[joint])
-    return joint == ancestor
 
 
 def segment_axes(skeleton: SkeletonModel, role: str) -> FloatArray:

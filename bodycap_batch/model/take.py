@@ -28,11 +28,6 @@ def exact_rate(fps: float) -> Fraction:
     return Fraction(fps).limit_denominator(_MAX_DENOMINATOR)
 
 
-def rate_text(rate: Fraction) -> str:
-    """Return a frame rate as text: ``30`` or ``30000/1001``."""
-    return str(rate)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timecode:
     """A timecode: the number of a frame on a clock that counts frames from midnight.
@@ -133,5 +128,5 @@ class Take:
     def figures(self) -> dict[str, Any]:
         """Return the name and the time as plain JSON values. Unknown values are left out."""
         out: dict[str, Any] = {"take": self.name} if self.name else {}
-        out |= {"rate": rate_text(self.rate), "fps": self.fps, "start_s": self.start_ns / 1e9}
+        out |= {"rate": str(self.rate), "fps": self.fps, "start_s": self.start_ns / 1e9}
         return out if self.timecode is None else {**out, "start_timecode": str(self.timecode)}

@@ -14,10 +14,9 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.model.geometry import so3_exp, so3_log
+from bodycap_batch.model.gravity import GRAVITY_M_S2
 from bodycap_batch.synthetic.options import ImuOptions
 
-_GRAVITY_M_S2 = 9.81
-"""Acceleration of gravity along −z of the world, m/s²."""
 _NOISE_RATE_HZ = 100.0
 """Samples per second to which the noise in the options refers."""
 _STEP_S = 0.01
@@ -32,7 +31,7 @@ def write_imu(
     options: ImuOptions,
     seconds: float,
     world_from_cam_at: Callable[[FloatArray], FloatArray],
-    seed: np.random.SeedSequence,
+    rng: np.random.Generator,
 ) -> None:
     """Write ``<camera>.imu.csv`` and the truth about the sensor, ``gt/<camera>.imu.json``.
 
@@ -43,9 +42,8 @@ def write_imu(
         seconds: Length of the recording on the clock of the camera, seconds.
         world_from_cam_at: Function that returns the poses (T,4,4) of the camera at times (T,) on its clock,
             seconds.
-        seed: Seed of bias, rotation and noise.
+        rng: Source of randomness for bias, rotation and noise.
     """
-    rng = np.random.default_rng(seed)
     axis = rng.normal(size=3)
     cam_from_sensor = so3_exp(np.radians(options.turned_deg) * axis / np.linalg.norm(axis))
     biases = [
@@ -93,6 +91,6 @@ def true_samples(
     step_s = max(interval_s, _STEP_S)
     early, now, late = (world_from_cam_at(times_s + shift) for shift in (-step_s, 0.0, step_s))
     acceleration = (early[:, :3, 3] - 2.0 * now[:, :3, 3] + late[:, :3, 3]) / step_s**2
-    force_in_world = acceleration + np.array([0.0, 0.0, _GRAVITY_M_S2])
+    force_in_world = acceleration + np.array([0.0, 0.0, GRAVITY_M_S2])
     force = np.einsum("nij,ni->nj", now[:, :3, :3], force_in_world)
     return np.asarray(rate, dtype=np.float64), np.asarray(force, dtype=np.float64)

@@ -20,7 +20,7 @@ from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.atomic_files import store_error_from_os_error, write_text
 from bodycap_batch.formats.gpmf_writer import append_settings
 from bodycap_batch.formats.mp4_writer import DataTrack, VideoWriter
-from bodycap_batch.formats.tum import seconds_text
+from bodycap_batch.formats.tum import TimedPoses, seconds_text, write_tum
 from bodycap_batch.model.skeleton import Mount
 from bodycap_batch.synthetic.atlas import Atlas, Bytes
 from bodycap_batch.synthetic.camera_sounds import CameraSounds
@@ -46,7 +46,6 @@ from bodycap_batch.synthetic.truth import (
     mean_poses,
     seconds_from_ns,
     write_calibration,
-    write_path,
     write_truth,
 )
 from bodycap_batch.synthetic.wearer import Wearer
@@ -137,7 +136,6 @@ def write_synthetic_capture(options: SynthOptions, out_dir: Path, context: Stage
         kept = _draw_kept_frames(options, subject)
         for mount in subject.mounts:
             _write_camera_truth(folder, options, subject, mount, kept[mount.camera])
-            _write_camera_imu(folder, options, subject, mount)
         if not options.poses_only:
             _write_videos(folder, options, subject, kept, context)
         write_truth(folder, options, subject.motion, subject.mounts)
@@ -167,52 +165,40 @@ def frame_times_ns(options: SynthOptions, camera: str) -> IntArray:
 def _write_camera_truth(
     folder: Path, options: SynthOptions, subject: Subject, mount: Mount, kept: BoolArray
 ) -> None:
-    """Write a camera's true path, its timestamps if frames are lost, and its noisy poses if requested."""
-    camera = mount.camera
+    """Write what is known of a camera besides its video: paths, timestamps of frames, sensor, noisy poses."""
+    camera, number = mount.camera, options.cameras.index(mount.camera)
     times_ns = frame_times_ns(options, camera)[kept]
     clock = true_clocks(options)[camera]
+
+    def lens_at(camera_s: FloatArray) -> FloatArray:
+        return camera_poses_at(subject.motion, mount, clock.common_s(camera_s))
+
+    def rng(purpose: str) -> np.random.Generator:
+        return np.random.default_rng([number, *subject.seeds[purpose].generate_state(4).tolist()])
+
+    def write(folder_name: str, at_ns: IntArray, poses: FloatArray, note: str) -> None:
+        timed = TimedPoses(times_ns=at_ns, world_from_cam=poses)
+        write_tum(folder / folder_name / f"{camera}.tum", timed, (note,))
+
     common_s = clock.common_s(seconds_from_ns(times_ns))
     poses = picture_poses_at(subject.motion, mount, common_s, stabilised=options.stabilised != "none")
-    write_path(folder / "gt" / f"{camera}.tum", times_ns, poses, "world_from_camera, the camera's own clock")
+    write("gt", times_ns, poses, "world_from_camera, the camera's own clock")
     if options.exposure_s:
-        pose_at = _poses_by_clock(options, subject, mount)
-        mean = mean_poses(pose_at, seconds_from_ns(times_ns), options.exposure_s)
+        mean = mean_poses(lens_at, seconds_from_ns(times_ns), options.exposure_s)
         note = "world_from_camera, mean over the exposure, the camera's own clock"
-        write_path(folder / "gt" / "exposure" / f"{camera}.tum", times_ns, mean, note)
+        write("gt/exposure", times_ns, mean, note)
     if options.stabilised != "none":
-        lens = camera_poses_at(subject.motion, mount, common_s)
         note = "world_from_lens of the camera that stabilises its pictures, the camera's own clock"
-        write_path(folder / "gt" / "lens" / f"{camera}.tum", times_ns, lens, note)
+        write("gt/lens", times_ns, lens_at(seconds_from_ns(times_ns)), note)
     if not kept.all():
         seconds = (f"{seconds_text(int(time))}\n" for time in times_ns)
         write_text(folder / f"{camera}.timestamps.txt", "".join(seconds))
     if options.poses_only:
-        seed = [options.cameras.index(camera), *subject.seeds["poses"].generate_state(4).tolist()]
-        measured, present = disturb_poses(poses, options, np.random.default_rng(seed))
-        write_path(
-            folder / "poses" / f"{camera}.tum",
-            times_ns[present],
-            measured[present],
-            "world_from_camera with noise, gross errors and gaps; the camera's own clock",
-        )
-
-
-def _write_camera_imu(folder: Path, options: SynthOptions, subject: Subject, mount: Mount) -> None:
-    """Write the samples of the inertial sensors on a camera, if they are requested."""
-    if options.imu is None:
-        return
-    number = options.cameras.index(mount.camera)
-    seed = np.random.SeedSequence([number, *subject.seeds["imu"].generate_state(4).tolist()])
-    poses_at = _poses_by_clock(options, subject, mount)
-    write_imu(folder, mount.camera, options.imu, options.seconds, poses_at, seed)
-
-
-def _poses_by_clock(
-    options: SynthOptions, subject: Subject, mount: Mount
-) -> Callable[[FloatArray], FloatArray]:
-    """Return the function that gives the poses (T,4,4) of a camera at times (T,) of its clock, seconds."""
-    clock = true_clocks(options)[mount.camera]
-    return lambda camera_s: camera_poses_at(subject.motion, mount, clock.common_s(camera_s))
+        measured, present = disturb_poses(poses, options, rng("poses"))
+        note = "world_from_camera with noise, gross errors and gaps; the camera's own clock"
+        write("poses", times_ns[present], measured[present], note)
+    if options.imu is not None:
+        write_imu(folder, camera, options.imu, options.seconds, lens_at, rng("imu"))
 
 
 def _write_videos(
@@ -261,9 +247,6 @@ def _recorded(  # noqa: PLR0913, PLR0917 - one value each
     def ideal(frame: int) -> Bytes:
         return renderer.render(float(times_s[frame]))
 
-    if not options.auto_exposure:
-        yield from _render_in_order(pool, lambda frame: sensor.record(ideal(frame), frame), frames, context)
-        return
     exposure = AutoExposure(options.auto_exposure, 1.0 / options.fps)
     for frame, image in zip(frames, _render_in_order(pool, ideal, frames, context), strict=True):
         yield sensor.record(image, frame, exposure.gain(image))

@@ -302,18 +302,12 @@ def _spread_to_pixels(mask: BoolArray, size: tuple[int, ...]) -> BoolArray:
 
 def _nearest_cells(distance: Float32, radius: int) -> IntArray:
     """Return the index (R,C) of the cell with the least distance (R,C) in a square around each cell."""
-    least, nearest = distance.copy(), np.arange(distance.size).reshape(distance.shape)
-    for axis in (0, 1):
-        from_least, from_nearest = least.copy(), nearest.copy()
-        for shift in [*range(-radius, 0), *range(1, radius + 1)]:
-            here = slice(max(0, -shift), -shift if shift > 0 else None)
-            there = slice(max(0, shift), shift if shift < 0 else None)
-            to = (here, slice(None)) if axis == 0 else (slice(None), here)
-            source = (there, slice(None)) if axis == 0 else (slice(None), there)
-            nearer = from_least[source] < least[to]
-            least[to] = np.where(nearer, from_least[source], least[to])
-            nearest[to] = np.where(nearer, from_nearest[source], nearest[to])
-    return nearest
+    order = np.argsort(distance, axis=None, kind="stable")
+    rank = np.empty(order.shape, np.float32)
+    rank[order] = np.arange(len(order))
+    side = 2 * radius + 1
+    least = cv2.erode(rank.reshape(distance.shape), np.ones((side, side), np.uint8))
+    return np.asarray(order[least.astype(np.int64)])
 
 
 def _blur(image: Bytes, moved: Float32, jumps: _Jumps) -> Bytes:

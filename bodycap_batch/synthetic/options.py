@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -121,6 +121,35 @@ _Skew = Annotated[float, Field(ge=-_MAX_SKEW_S, le=_MAX_SKEW_S)]
 _Moment = Annotated[float, Field(ge=0, le=_MAX_SECONDS)]
 _Rate = Annotated[float, Field(ge=MIN_FPS, le=MAX_FPS)]
 _GapFrames = Annotated[int, Field(ge=1, le=_MAX_FRAMES)]
+
+
+_MOTION = "the program does not change the motion of the BVH file"
+_WALK = "only the simple walk can do it"
+_VIDEO = "no videos are written"
+_EXCLUSIVE = (
+    *(
+        (key, "motion", _MOTION)
+        for key in ("t_pose_s", "on_the_spot", "still", "carried_s", "pressed_s", "walk")
+    ),
+    ("still", "on_the_spot", "both say how the person stands"),
+    ("still", "walk", _WALK),
+    ("carried_s", "walk", _WALK),
+    ("sound", "poses_only", _VIDEO),
+    ("stabilised", "poses_only", _VIDEO),
+    ("bit_rate_mbps", "quality", "a lossless video has no given bit rate"),
+    ("room", "bare", "bare surfaces differ from the others"),
+)
+"""Options that cannot be used together, and why."""
+_NEEDED = (
+    *(
+        (key, "body_in_view", "it cannot be seen without body_in_view")
+        for key in ("carried_s", "hand_in_view", "pressed_s", "clothes")
+    ),
+    *((key, "sound", "it has no effect without sound") for key in ("sound_skews_s", "sound_skew_range_s")),
+    ("drifts_ppm", "clocks", "common clocks have no drift"),
+    ("rates_fps", "poses_only", "videos have one rate"),
+)
+"""Options that need another one, and why."""
 
 
 class SynthOptions(Options):
@@ -433,139 +462,81 @@ class SynthOptions(Options):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        for name in self.cameras:
-            if mount_of(name) is None:
-                raise ValueError(f"cameras: {name!r} is not the name of a place on the body")
-        if len(set(self.cameras)) != len(self.cameras):
-            raise ValueError("cameras: each name must occur only once")
-        if self.lens not in CAMERA_MODELS:
-            raise ValueError(
-                f"lens: there is no camera model {self.lens!r}; use one of {', '.join(CAMERA_MODELS)}"
-            )
-        if self.lens_params is not None and len(self.lens_params) != parameter_count(self.lens):
-            raise ValueError(
-                f"lens_params: the model {self.lens} needs {parameter_count(self.lens)} parameters"
-            )
-        if len(set(self.bare)) != len(self.bare):
-            raise ValueError("bare: each surface must occur only once")
-        self._check_cameras_named()
-        self._check_clocks()
-        self._check_frames()
-        if self.exposure_s > 1.0 / self.fps or self.rolling_shutter_s > 1.0 / self.fps:
-            raise ValueError(
-                "exposure_s and rolling_shutter_s cannot be longer than the time between two frames (1 / fps)"
-            )
-        self._check_movements()
-        for key in ("t_pose_s", "on_the_spot", "still", "carried_s"):
-            if self.motion is not None and getattr(self, key):
-                raise ValueError(
-                    f"{key} cannot be used with motion, because the program does not change the motion of "
-                    "the BVH file; leave out one of the two"
-                )
-        if self.motion is not None and self.walk != "simple":
-            raise ValueError(
-                "walk cannot be used with motion, because the motion of the BVH file replaces the built-in "
-                "walk; leave out one of the two"
-            )
-        self._check_pressed()
+        for problems in (self._name_problems, self._pair_problems, self._place_problems, self._time_problems):
+            for problem in problems():
+                raise ValueError(problem)
         return self
 
-    def _check_movements(self) -> None:
-        """Check the options that change what the person does, and those that need another option."""
-        if self.walk == "gait" and (self.still or self.carried_s):
-            raise ValueError("walk: still and carried_s need the simple walk; leave out one of the two")
-        if self.still and self.on_the_spot:
-            raise ValueError("still cannot be used with on_the_spot; leave out one of the two")
-        for key in ("carried_s", "hand_in_view"):
-            if getattr(self, key) and not self.body_in_view:
-                raise ValueError(f"{key} cannot be seen without body_in_view; set body_in_view")
-        places = [mount_of(name) for name in self.cameras]
-        roles = [place[1] for place in places if place is not None]
-        for side, (start_s, end_s) in self.carried_s.items():
-            if f"{side.capitalize()}Hand" in roles:
-                raise ValueError(f"carried_s: the box would cover the camera on the {side} hand")
-            if end_s <= start_s:
-                raise ValueError(f"carried_s: the end of the time for {side} is not after its start")
-        if self.hand_in_view and not any(role.endswith("ForeArm") for role in roles):
-            raise ValueError("hand_in_view: there is no camera on a forearm")
-        if self.room == "two_rooms" and (self.motion is not None or self.walk != "simple"):
-            raise ValueError("room: two_rooms needs the simple built-in walk, which passes the openings")
-        if self.room != "single" and (self.bare or not self.furnished):
-            raise ValueError("room: identical parts cannot be used with bare or without furniture")
-        if self.bit_rate_mbps is not None and self.quality == "lossless":
-            raise ValueError(
-                "bit_rate_mbps cannot be used with the quality lossless; leave out one of the two"
-            )
-
-    def _check_cameras_named(self) -> None:
-        """Check the options that have a value for each camera, and the lengths of gaps.
-
-        All camera names must exist. Different frame rates are permitted only without videos.
-        """
+    def _name_problems(self) -> Iterator[str]:
+        """Yield what is wrong with names of cameras, of surfaces and of the lens."""
+        for name in self.cameras:
+            if mount_of(name) is None:
+                yield f"cameras: {name!r} is not the name of a place on the body"
+        if len(set(self.cameras)) != len(self.cameras):
+            yield "cameras: each name must occur only once"
+        if self.lens not in CAMERA_MODELS:
+            yield f"lens: there is no camera model {self.lens!r}; use one of {', '.join(CAMERA_MODELS)}"
+        elif self.lens_params is not None and len(self.lens_params) != parameter_count(self.lens):
+            yield f"lens_params: the model {self.lens} needs {parameter_count(self.lens)} parameters"
+        if len(set(self.bare)) != len(self.bare):
+            yield "bare: each surface must occur only once"
         for key in ("offsets_s", "drifts_ppm", "sound_skews_s", "rates_fps"):
-            named = getattr(self, key)
-            unknown = sorted(set(named) - set(self.cameras))
+            unknown = sorted(set(getattr(self, key)) - set(self.cameras))
             if unknown:
-                raise ValueError(f"{key}: there is no camera {', '.join(unknown)}")
-        if self.rates_fps and not self.poses_only:
-            raise ValueError("rates_fps: videos have one rate; set poses_only")
+                yield f"{key}: there is no camera {', '.join(unknown)}"
+
+    def _place_problems(self) -> Iterator[str]:
+        """Yield what is wrong with options for hands and forearms."""
+        places = {name: mount_of(name) for name in self.cameras}
+        roles = {name: place[1] for name, place in places.items() if place is not None}
+        for name in self.pressed_s:
+            if not roles.get(name, "").endswith("Hand"):
+                yield f"pressed_s: there is no camera {name} on a hand"
+        for side in self.carried_s:
+            if f"{side.capitalize()}Hand" in roles.values():
+                yield f"carried_s: the box would cover the camera on the {side} hand"
+        if self.hand_in_view and not any(role.endswith("ForeArm") for role in roles.values()):
+            yield "hand_in_view: there is no camera on a forearm"
+
+    def _pair_problems(self) -> Iterator[str]:
+        """Yield which options cannot be used together, or have no effect without another one."""
+        for key, other, reason in _EXCLUSIVE:
+            if self._is_set(key) and self._is_set(other):
+                yield f"{key}: cannot be used with {other}, because {reason}; leave out one of the two"
+        for key, other, reason in _NEEDED:
+            if self._is_set(key) and not self._is_set(other):
+                yield f"{key}: {reason}; set {other}"
+        if self.room != "single" and not self.furnished:
+            yield "room: identical parts cannot be used without furniture"
+        if self.room == "two_rooms" and (self._is_set("motion") or self._is_set("walk")):
+            yield "room: two_rooms needs the simple built-in walk, which passes the openings"
+
+    def _time_problems(self) -> Iterator[str]:
+        """Yield what is wrong with times, and with the number of frames, which takes memory."""
+        if self.exposure_s > 1.0 / self.fps or self.rolling_shutter_s > 1.0 / self.fps:
+            yield "exposure_s, rolling_shutter_s: they cannot exceed the time between two frames (1 / fps)"
+        for key, spans in (("carried_s", self.carried_s), ("pressed_s", self.pressed_s)):
+            for name, (start_s, end_s) in spans.items():
+                if end_s <= start_s:
+                    yield f"{key}: the end of the time for {name} is not after its start"
         if self.gap_frames[0] > self.gap_frames[1]:
-            raise ValueError("gap_frames: shortest first")
-
-    def _check_clocks(self) -> None:
-        """Check that options which need free clocks or sound are used with these only."""
-        if self.drifts_ppm and self.clocks != "free":
-            raise ValueError("drifts_ppm: common clocks have no drift; set clocks to free")
-        for key in ("sound_skews_s", "sound_skew_range_s"):
-            if getattr(self, key) and not self.sound:
-                raise ValueError(f"{key} has no effect without sound; set sound to true")
-        if self.sound and self.poses_only:
-            raise ValueError(
-                "sound: poses_only writes no videos, which contain the sound; leave out one of them"
-            )
-        if self.stabilised != "none" and self.poses_only:
-            raise ValueError("stabilised: poses_only writes no videos; leave out one of them")
+            yield "gap_frames: shortest first"
         if self.sound and self.seconds > _MAX_SOUND_S:
-            raise ValueError(
-                f"seconds: a video with sound can last {_MAX_SOUND_S:g} s at most; lower seconds, or set "
-                "sound to false"
-            )
-
-    def _check_frames(self) -> None:
-        """Check the number of frames, which determines the memory that the renderer needs."""
+            yield f"seconds: a video with sound can last {_MAX_SOUND_S:g} s at most; lower seconds"
         drawn_s = self.offset_range_s if self.clocks == "free" else 0.0
         offsets_s = [0.0, -drawn_s, drawn_s, *self.offsets_s.values()]
         length_s = self.seconds + max(offsets_s) - min(offsets_s)
         fps = max(self.fps, *self.rates_fps.values(), self.fps)
         if length_s * fps > _MAX_FRAMES:
-            raise ValueError(
+            yield (
                 f"seconds: {length_s:g} s at {fps:g} frames per second are more than {_MAX_FRAMES} frames; "
                 "lower seconds, fps or offsets_s"
             )
 
-    def _check_pressed(self) -> None:
-        """Check the option that holds a hand against the chest.
-
-        Only the built-in walk supports it, only for hands, and only if the body is rendered.
-        """
-        for name, (start_s, end_s) in self.pressed_s.items():
-            place = mount_of(name)
-            if name not in self.cameras or place is None or not place[1].endswith("Hand"):
-                raise ValueError(f"pressed_s: there is no camera {name} on a hand")
-            if end_s <= start_s:
-                raise ValueError(f"pressed_s: the end of the time for {name} is not after its start")
-        if self.pressed_s and not self.body_in_view:
-            raise ValueError(
-                "pressed_s cannot be used without body_in_view, because the chest is not visible; set "
-                "body_in_view"
-            )
-        if self.clothes != "plain" and not self.body_in_view:
-            raise ValueError("clothes cannot be seen without body_in_view; set body_in_view")
-        if self.pressed_s and self.motion is not None:
-            raise ValueError(
-                "pressed_s cannot be used with motion, because the program does not change the motion of the "
-                "BVH file; leave out one of the two"
-            )
+    def _is_set(self, key: str) -> bool:
+        """Return True if an option does not have its default value."""
+        field = type(self).model_fields[key]
+        return bool(getattr(self, key) != field.get_default(call_default_factory=True))
 
     @property
     def frame_count(self) -> int:

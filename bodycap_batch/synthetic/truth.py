@@ -15,7 +15,6 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.formats.atomic_files import atomic_replacement, write_text
 from bodycap_batch.formats.bvh import write_bvh
-from bodycap_batch.formats.tum import TimedPoses, write_tum
 from bodycap_batch.model.geometry import invert, make_transform, quat_xyzw_from_rotation, so3_exp, so3_log
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
 from bodycap_batch.synthetic.clocks import has_own_clocks, reference_name, true_clocks
@@ -62,8 +61,6 @@ contacts.json  stances of each foot (left, right) in ascending order. strike_s: 
                the common clock. Between strike_s and off_s the foot rolls without slipping: about the heel
                until the foot is flat, and about the tip of the toes when the heel has risen.
 """
-_CLOCK_OPTIONS = {"clocks", "drifts_ppm", "sound", "sound_ratio_db", "sound_skews_s", "sound_skew_range_s"}
-"""Options that are left out of the truth if no camera has its own clock or sound."""
 _EXPOSURE_STEPS = 24
 """Number of instants whose mean is the pose over an exposure. Origin: 0.4 ms of an exposure of 10 ms, a
 twentieth of the interval of a recorded motion."""
@@ -120,20 +117,15 @@ def write_truth(folder: Path, options: SynthOptions, motion: MovingBody, mounts:
         for mount in mounts
     }
     _write_json(truth / "mounts.json", content)
-    own_clocks = has_own_clocks(options)
-    if own_clocks:
+    readme = _README
+    if has_own_clocks(options):
         _write_clocks(truth / "clocks.json", options)
-    readme = _README + (_CLOCKS_README if own_clocks else "")
-    hidden = set() if own_clocks else set(_CLOCK_OPTIONS)
-    if options.stabilised == "none":
-        hidden.add("stabilised")
+        readme += _CLOCKS_README
     if isinstance(motion, StanceWalk):
         _write_contacts(truth / "contacts.json", motion, seconds_from_ns(ticks))
         readme += _CONTACTS_README
-    else:
-        hidden.add("walk")
     write_text(truth / "README.txt", readme)
-    settings = options.model_dump(mode="json", exclude=hidden)
+    settings = options.model_dump(mode="json")
     if options.motion is not None:
         settings["motion"] = options.motion.name
     _write_json(truth / "synth.json", settings)
@@ -175,19 +167,6 @@ def mean_poses(
         turn += so3_log(moved[:, :3, :3]) / _EXPOSURE_STEPS
         shift += moved[:, :3, 3] / _EXPOSURE_STEPS
     return np.asarray(middle @ make_transform(so3_exp(turn), shift))
-
-
-def write_path(path: Path, times_ns: IntArray, world_from_cam: FloatArray, note: str) -> None:
-    """Write the path of a camera as a TUM file.
-
-    Args:
-        path: Path of the file.
-        times_ns: (T,) times on the camera's own clock, nanoseconds.
-        world_from_cam: (T,4,4) poses of the camera.
-        note: Text for the header of the file.
-    """
-    poses = TimedPoses(times_ns=times_ns, world_from_cam=world_from_cam)
-    write_tum(path, poses, (note,))
 
 
 def _write_clocks(path: Path, options: SynthOptions) -> None:

@@ -28,7 +28,7 @@ from bodycap_batch.capture import CaptureCamera, open_capture
 from bodycap_batch.config.job import load_job
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.evaluate.picture_check import read_pictures
-from bodycap_batch.evaluate.right_frames import Pictures, RightFrames, find_right_frames, measure_pictures
+from bodycap_batch.evaluate.right_frames import Pictures, RightFrames, find_right_frames
 from bodycap_batch.evaluate.two_view import Outcome
 from bodycap_batch.formats.tum import read_tum
 from bodycap_batch.model.geometry import invert, make_transform, poses_at, so3_exp
@@ -197,8 +197,7 @@ def true_readout_s(folder: Path) -> float:
 
 def judge(pictures: Pictures, world_from_cam: FloatArray) -> RightFrames:
     """Judge poses by the pictures."""
-    posed = np.isfinite(world_from_cam[:, 0, 3])
-    return find_right_frames(measure_pictures(pictures, posed), world_from_cam)
+    return find_right_frames(pictures, world_from_cam)
 
 
 def run_camera(name: str, pictures: Pictures, path: FloatArray, cases: int) -> dict[str, Any]:

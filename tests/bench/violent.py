@@ -74,8 +74,8 @@ def prepare(capture: Path, work: Path, end_s: float | None) -> Path:
     for number, video in enumerate(sorted(folder.glob("*.mp4"))):
         if not (folder / f"{video.stem}.imu.csv").exists():
             poses, length_s = smooth_path(folder / "gt" / f"{video.stem}.tum")
-            seed = np.random.SeedSequence([7, number])
-            write_imu(folder, video.stem, ImuOptions(), length_s, poses, seed)
+            rng = np.random.default_rng([7, number])
+            write_imu(folder, video.stem, ImuOptions(), length_s, poses, rng)
     for name, uses in JOBS.items():
         job: dict[str, Any] = {
             "name": name,

@@ -10,8 +10,9 @@ from typing import Any
 
 from bodycap_batch.cli import main
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.evaluate import TrajectoryReport, evaluate_trajectories
+from bodycap_batch.evaluate import TrajectoryReport
 from bodycap_batch.synthetic import SynthOptions, synthesise
+from tests.evaluation import evaluate_trajectories
 
 SMALL: dict[str, Any] = {"seconds": 4.0, "width": 480, "height": 360, "seed": 5}
 FISHEYE = {"lens": "OPENCV_FISHEYE", "lens_params": (225.0, 225.0, 241.5, 178.5, 0.03, -0.01, 0.004, -0.001)}

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from bodycap_batch.cli import main
-from bodycap_batch.evaluate import evaluate_trajectories
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.formats.tum import read_tum
+from tests.evaluation import evaluate_trajectories
 from tests.pipeline.tiny_job import JOB, Place
 from tests.results import results_of
 

@@ -10,9 +10,9 @@ import pytest
 
 from bodycap_batch import Result
 from bodycap_batch.cli import main
-from bodycap_batch.evaluate import evaluate_trajectories
 from bodycap_batch.formats.tum import TimedPoses, read_tum, write_tum
 from bodycap_batch.model.camera import Camera
+from tests.evaluation import evaluate_trajectories
 from tests.pipeline.hard_captures import MAX_ATE_M, MIN_ATE_M, MIN_COVERAGE, rows_of, run
 from tests.rooms import LENS, Room, stroll
 from tests.videos import write_video

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.evaluate import evaluate_trajectories
 from bodycap_batch.report.grades import Grade
 from bodycap_batch.report.verdict import judge
 from tests.altered import Recording, alter, frozen, on_a_tripod
+from tests.evaluation import evaluate_trajectories
 from tests.pipeline.hard_captures import MAX_ATE_M, render, rows_of, run
 
 pytestmark = pytest.mark.slow

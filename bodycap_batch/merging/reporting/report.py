@@ -51,9 +51,8 @@ from bodycap_batch.model.merge_report import (
     ScaleSourceReport,
     SlippedMountsReport,
     SolverReport,
-    StillPartReport,
+    SpanReport,
     SwappedSidesReport,
-    TPoseReport,
     VerticalReport,
 )
 from bodycap_batch.model.skeleton import Mount, MountSlip
@@ -147,7 +146,7 @@ def build_report(
         inverted_cameras=_inverted_cameras_report(inputs.mounts, calibration),
         slipped_mounts=_slips_report(calibration.mounts, facts),
         still_cameras={
-            camera: StillPartReport(
+            camera: SpanReport(
                 from_s=round(1e-9 * (first_ns - facts.start_ns), 3),
                 to_s=round(1e-9 * (last_ns - facts.start_ns), 3),
             )
@@ -278,11 +277,11 @@ def _vertical_report(
     )
 
 
-def _t_pose_report(calibration: BodyCalibration, start_ns: int) -> TPoseReport | None:
+def _t_pose_report(calibration: BodyCalibration, start_ns: int) -> SpanReport | None:
     if calibration.t_pose_ns is None:
         return None
     first, last = (round(1e-9 * (time - start_ns), 3) for time in calibration.t_pose_ns)
-    return TPoseReport(from_s=first, to_s=last)
+    return SpanReport(from_s=first, to_s=last)
 
 
 def _mount_report(prior: Mount, solved: Mount, calibration: BodyCalibration) -> MountReport:

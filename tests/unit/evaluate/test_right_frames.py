@@ -14,11 +14,9 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.evaluate.breaks import contradicted_times, scale_jumps
 from bodycap_batch.evaluate.fresh_features import CELLS, FrameFeatures, detect_features, match_features
 from bodycap_batch.evaluate.right_frames import (
-    PictureEvidence,
     Pictures,
     _not_fixed_to_camera,
     find_right_frames,
-    measure_pictures,
 )
 from bodycap_batch.evaluate.three_view import judge_legs
 from bodycap_batch.evaluate.two_view import Outcome
@@ -102,35 +100,30 @@ def seen(path: FloatArray) -> Pictures:
     return Pictures(pictures(path))
 
 
-@pytest.fixture(scope="module")
-def evidence(seen: Pictures) -> PictureEvidence:
-    return measure_pictures(seen, np.ones(FRAMES, dtype=bool))
+def outcomes(seen: Pictures, path: FloatArray) -> np.ndarray:
+    return np.array([str(each) for each in find_right_frames(seen, path).outcome])
 
 
-def outcomes(evidence: PictureEvidence, path: FloatArray) -> np.ndarray:
-    return np.array([str(each) for each in find_right_frames(evidence, path).outcome])
-
-
-def test_a_true_path_is_right(evidence: PictureEvidence, path: FloatArray) -> None:
-    found = find_right_frames(evidence, path)
+def test_a_true_path_is_right(seen: Pictures, path: FloatArray) -> None:
+    found = find_right_frames(seen, path)
     assert found.count(Outcome.RIGHT) == FRAMES
     assert found.links.get(Outcome.WRONG, 0) == 0
     assert found.positions.get(Outcome.WRONG, 0) == 0
     assert found.positions[Outcome.RIGHT] > 40
 
 
-def test_another_gauge_changes_nothing(evidence: PictureEvidence, path: FloatArray) -> None:
+def test_another_gauge_changes_nothing(seen: Pictures, path: FloatArray) -> None:
     moved = make_transform(so3_exp([0.3, -1.0, 0.5]), [3.0, 1.0, -2.0]) @ path
     moved[:, :3, 3] *= 0.07
-    assert (outcomes(evidence, moved) == "right").all()
+    assert (outcomes(seen, moved) == "right").all()
 
 
-def test_noise_of_the_poses_is_no_error(evidence: PictureEvidence, path: FloatArray) -> None:
+def test_noise_of_the_poses_is_no_error(seen: Pictures, path: FloatArray) -> None:
     rng = np.random.default_rng(3)
     noise = make_transform(so3_exp(np.deg2rad(0.3) * rng.normal(size=(FRAMES, 3))), np.zeros((FRAMES, 3)))
     noisy = path @ noise
     noisy[:, :3, 3] += 0.003 * rng.normal(size=(FRAMES, 3))
-    assert (outcomes(evidence, noisy) == "right").all()
+    assert (outcomes(seen, noisy) == "right").all()
 
 
 def fold(path: FloatArray) -> FloatArray:
@@ -153,10 +146,10 @@ def other_scale(path: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize("harm", [fold, leap, other_scale])
 def test_a_broken_path_is_found(
-    evidence: PictureEvidence, path: FloatArray, harm: Callable[[FloatArray], FloatArray]
+    seen: Pictures, path: FloatArray, harm: Callable[[FloatArray], FloatArray]
 ) -> None:
     broken = np.concatenate([path[:BREAK], harm(path)[BREAK:]])
-    found = outcomes(evidence, broken)
+    found = outcomes(seen, broken)
     assert (found[: BREAK - BORDER_FRAMES] == "right").all()
     assert (found[BREAK + BORDER_FRAMES :] == "wrong").all()
 
@@ -167,12 +160,11 @@ def test_a_fold_across_lost_frames_is_found_from_the_rotations_between(
     posed = np.ones(FRAMES, dtype=bool)
     posed[25:75] = False
     # Frames that are 45 apart have no pose across the gap, so only the chain of rotations can show the fold.
-    evidence = measure_pictures(seen, posed)
     delivered = np.where(posed[:, None, None], path, np.nan)
-    assert find_right_frames(evidence, delivered).count(Outcome.RIGHT) == np.count_nonzero(posed)
+    assert find_right_frames(seen, delivered).count(Outcome.RIGHT) == np.count_nonzero(posed)
     folded = delivered.copy()
     folded[75:] = fold(path)[75:]
-    found = outcomes(evidence, folded)
+    found = outcomes(seen, folded)
     assert (found[:25] == "right").all()
     assert (found[25:75] == "None").all()
     assert (found[75:] == "wrong").all()
@@ -188,12 +180,12 @@ def test_tracks_find_a_fold_where_lost_frames_have_no_features(path: FloatArray)
         sigma_rad=np.full(FRAMES - 1, 1e-4),
         turn_sigma=0.05,
     )
-    evidence = measure_pictures(Pictures(blurred, rotation_chain=turns), posed)
+    seen = Pictures(blurred, rotation_chain=turns)
     delivered = np.where(posed[:, None, None], path, np.nan)
-    assert find_right_frames(evidence, delivered).count(Outcome.WRONG) == 0
+    assert find_right_frames(seen, delivered).count(Outcome.WRONG) == 0
     folded = delivered.copy()
     folded[60:] = fold(path)[60:]
-    assert find_right_frames(evidence, folded).count(Outcome.WRONG) == 40
+    assert find_right_frames(seen, folded).count(Outcome.WRONG) == 40
 
 
 def test_one_wrong_measurement_among_right_ones_is_no_break() -> None:
@@ -220,7 +212,7 @@ def test_rays_of_a_rolling_shutter_are_moved_to_the_middle_row() -> None:
 
 def test_without_matches_nothing_is_claimed(path: FloatArray) -> None:
     blank: list[FrameFeatures | None] = [None] * FRAMES
-    found = find_right_frames(measure_pictures(Pictures(blank), np.ones(FRAMES, dtype=bool)), path)
+    found = find_right_frames(Pictures(blank), path)
     assert found.count(Outcome.UNMEASURABLE) == FRAMES
 
 

@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.evaluate import (
-    evaluate_trajectories,
     relative_camera_error,
     score_trajectories,
 )
 from bodycap_batch.formats.tum import TimedPoses, read_tum, write_tum
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
+from tests.evaluation import evaluate_trajectories
 
 RATE_NS = 33_333_333
 

@@ -96,12 +96,3 @@ def test_poses_do_not_replace_measured_angular_velocities() -> None:
     off = np.linalg.norm(path.rotation.rate - rate(seconds), axis=1)[inner]
     assert off.max() < 0.2  # without the gyroscope, noise of 0.01 rad in a frame interval is 0.4 rad/s
     assert path.rotation.gyro is not None
-
-
-def test_correction_of_the_relation_moves_samples_to_the_better_clock_and_axes() -> None:
-    turn, late_s, bias = so3_exp(np.array([0.02, -0.03, 0.01])), 0.004, np.array([0.05, 0.0, -0.02])
-    gyro = measured()
-    wrong = GyroRates(times_s=gyro.times_s + late_s, rate_rad_s=gyro.rate_rad_s @ turn + bias)
-    better = wrong.turned(turn, late_s, bias)
-    np.testing.assert_allclose(better.times_s, gyro.times_s, atol=1e-12)
-    np.testing.assert_allclose(better.rate_rad_s, gyro.rate_rad_s, atol=1e-12)

@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import pytest
 
-from bodycap_batch.model.take import Take, Timecode, exact_rate, rate_text
+from bodycap_batch.model.take import Take, Timecode, exact_rate
 
 NTSC = Fraction(30000, 1001)
 
@@ -27,7 +27,7 @@ NTSC = Fraction(30000, 1001)
     ],
 )
 def test_rates_of_television_are_exact(fps: float, text: str) -> None:
-    assert rate_text(exact_rate(fps)) == text
+    assert str(exact_rate(fps)) == text
 
 
 def parsed(text: str, rate: Fraction) -> Timecode:

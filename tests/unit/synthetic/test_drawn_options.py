@@ -172,10 +172,10 @@ def test_a_still_person_moves_the_hands_but_not_the_head():
         ),
         ({"hand_in_view": 0.4, "body_in_view": True}, "no camera on a forearm"),
         ({"still": True, "on_the_spot": True}, "leave out one"),
-        ({"still": True, "walk": "gait"}, "need the simple walk"),
+        ({"still": True, "walk": "gait"}, "only the simple walk"),
         ({"room": "two_rooms", "walk": "gait"}, "needs the simple built-in walk"),
         ({"room": "bays_90", "bare": ("floor",)}, "cannot be used with bare"),
-        ({"bit_rate_mbps": 2.0, "quality": "lossless"}, "cannot be used with the quality lossless"),
+        ({"bit_rate_mbps": 2.0, "quality": "lossless"}, "bit_rate_mbps: cannot be used with quality"),
     ],
 )
 def test_invalid_options_are_refused(values, message):
