@@ -293,6 +293,6 @@ def test_the_default_capture_is_unchanged(tmp_path):
         SynthOptions(seconds=1.0, poses_only=True), tmp_path / "a", StageContext(work_dir=tmp_path, threads=1)
     )
     assert not (tmp_path / "a/gt/contacts.json").exists()
-    assert "walk" not in json.loads((tmp_path / "a/gt/synth.json").read_text())
-    with pytest.raises(ValidationError, match="walk cannot be used with motion"):
+    assert json.loads((tmp_path / "a/gt/synth.json").read_text())["walk"] == "simple"
+    with pytest.raises(ValidationError, match="walk: cannot be used with motion"):
         SynthOptions(walk="gait", motion="walk.bvh")
