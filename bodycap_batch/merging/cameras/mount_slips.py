@@ -363,7 +363,7 @@ def _occurrence(smooth: FloatArray) -> FloatArray:
 
 
 def _log_shares(shares: FloatArray) -> FloatArray:
-    return np.log((1.0 - _FREE_SHARE) * shares + _FREE_SHARE / shares.shape[-1])
+    return np.asarray(np.log((1.0 - _FREE_SHARE) * shares + _FREE_SHARE / shares.shape[-1]))
 
 
 def _weights_elsewhere(windows: IntArray, sample: IntArray, occurrence: FloatArray) -> FloatArray:
