@@ -2,9 +2,10 @@
 
 A limb moves smoothly; a strap that slips changes the pose of the camera from one frame to the next, and the
 change stays. Two hypotheses about the frames around each instant are compared: a smooth motion, and a smooth
-motion with a step of the camera in its own axes. The motion is a Gaussian process: white noise on
-acceleration. The sizes of acceleration and of the noise of the poses differ from moment to moment. So each
-hypothesis is averaged over a grid of sizes, weighted by how often they occur in the path itself.
+motion with a step of the camera in its own axes. The motion is a Gaussian process: the acceleration is white
+noise, or changes over a tenth of a second. The sizes of acceleration and of the noise of the poses differ
+from moment to moment. So each hypothesis is averaged over a grid of motions, weighted by how often they occur
+in the rest of the path.
 """
 
 from __future__ import annotations
@@ -35,12 +36,14 @@ cm and more."""
 _MAX_TRANSITION_FRAMES = 2
 """Maximum number of frames at which the camera is under way from its old to its new place. Evidence:
 docs/decisions/merging.md."""
-_LOG_EVIDENCE = 7.5
+_LOG_EVIDENCE = 8.5
 """Minimum logarithm of the ratio of the likelihoods of a slip and of no slip. Evidence:
 docs/decisions/merging.md."""
 _MISSING_INTERVALS = 0.5, 3.5
 """Limits of the number of frame intervals that a recording lacks at one instant. Evidence:
 docs/decisions/merging.md."""
+_INTERVALS = 13
+"""Number of possible intervals between these limits. Evidence: none."""
 _USUAL_WINDOWS = 300
 """Number of windows of a take of 10 s, as those that determined the minimum evidence."""
 _MIN_STEP = float(np.radians(5.0)), 0.015
@@ -50,6 +53,11 @@ _NEXT_FRAME = 1.5
 """Maximum step between successive frames without a lost frame between them, in frame intervals."""
 _PIVOT_ITERATIONS = 10
 """Number of iterations of the robust fit of the pivot. Evidence: none."""
+_SMOOTH_S = 0.1
+"""Correlation time (seconds) of the acceleration of a smooth motion. Evidence: docs/decisions/merging.md."""
+_INTEGRATION_S = 0.005
+"""Step (seconds) of the numerical integration of the acceleration. Derivation: a sixth of a frame
+interval."""
 _WINDOWS_AT_ONCE = 1000
 """Number of windows that are compared at once, and that show how often each motion occurs. Derivation: they
 need 140 MB."""
@@ -68,19 +76,24 @@ class _Part(NamedTuple):
         noise: (G,) sigma of a pose per axis: radians or metres.
         change: (G,) standard deviation per axis that the motion adds to a constant velocity in one frame
             interval: radians or metres.
+        is_smooth: (G,) True if the acceleration changes over `_SMOOTH_S`, False if it is white noise.
         step_sigma: Sigma of a step per axis: radians or metres.
         free_sigma: Sigma of the place and of the movement in a window: radians or metres.
     """
 
     noise: FloatArray
     change: FloatArray
+    is_smooth: BoolArray
     step_sigma: float
     free_sigma: float
 
 
 def _part(noise: tuple[float, float], change: tuple[float, float], step: float, free: float) -> _Part:
-    noises, changes = np.meshgrid(np.geomspace(*noise, 9), np.geomspace(*change, 14))
-    return _Part(noises.reshape(-1), changes.reshape(-1), step, free)
+    noises, changes, is_smooth = (
+        each.reshape(-1)
+        for each in np.meshgrid(np.geomspace(*noise, 6), np.geomspace(*change, 9), np.array([False, True]))
+    )
+    return _Part(noises, changes, is_smooth, step, free)
 
 
 _PARTS = (
@@ -189,12 +202,17 @@ def _steps(track: CameraTrack) -> list[_Step]:
     windows = _windows(replace(track, map_from_cam=track.map_from_cam @ pivot_in_cam), frames)
     if not len(windows.first_after):
         return []
-    sample = windows.take(evenly_spaced(len(windows.first_after), _WINDOWS_AT_ONCE))
-    weights = [_motion_weights(each.smooth) for each in _both_parts(sample)]
+    numbers = np.arange(len(windows.first_after))
+    sample = evenly_spaced(len(numbers), _WINDOWS_AT_ONCE)
+    occurrences = [_occurrence(each.smooth) for each in _both_parts(windows.take(sample))]
+
+    def weights_of(some: IntArray) -> list[FloatArray]:
+        return [_weights_elsewhere(some, sample, each) for each in occurrences]
+
     by_duration = np.hstack(
         [
-            _slip_evidence(windows.take(slice(start, start + _WINDOWS_AT_ONCE)), weights)
-            for start in range(0, len(windows.first_after), _WINDOWS_AT_ONCE)
+            _slip_evidence(windows.take(some), weights_of(some))
+            for some in np.split(numbers, np.arange(_WINDOWS_AT_ONCE, len(numbers), _WINDOWS_AT_ONCE))
         ]
     )
     evidence = np.asarray(logsumexp(by_duration, axis=0) - np.log(len(by_duration)))
@@ -202,7 +220,7 @@ def _steps(track: CameraTrack) -> list[_Step]:
     evidence -= np.log(max(1.0, len(evidence) / _USUAL_WINDOWS))
     out: list[_Step] = []
     for index in _peaks(evidence):
-        window = windows.take(slice(index, index + 1))
+        window, weights = windows.take(slice(index, index + 1)), weights_of(np.array([index]))
         if evidence[index] - _wrong_frames_evidence(window, weights) < _LOG_EVIDENCE:
             continue
         under_way = _transitions()[int(np.argmax(by_duration[:, index]))]
@@ -303,8 +321,9 @@ def _precisions(times_s: FloatArray, part: _Part, wrong: BoolArray | None) -> tu
         wrong: (2K,) True for frames whose poses may be wrong; None without such frames.
     """
     earlier, later = np.minimum.outer(times_s, times_s), np.maximum.outer(times_s, times_s)
-    # Covariance of white noise that is integrated twice, per variance of the change in one frame interval.
-    integrated = (earlier**2 * later / 2.0 - earlier**3 / 6.0) / (_FRAME_S**3 / 3.0)
+    # Covariance of the acceleration that is integrated twice, per variance of the change in one interval.
+    white = (earlier**2 * later / 2.0 - earlier**3 / 6.0) / (_FRAME_S**3 / 3.0)
+    integrated = np.where(part.is_smooth[:, None, None], _smooth_covariance(times_s), white)
     free = np.column_stack([np.ones_like(times_s), times_s / times_s[-1]])
     fixed = part.free_sigma**2 * free @ free.T
     if wrong is not None:
@@ -314,8 +333,22 @@ def _precisions(times_s: FloatArray, part: _Part, wrong: BoolArray | None) -> tu
     return np.linalg.inv(covariance), np.linalg.slogdet(covariance)[1]
 
 
-def _motion_weights(smooth: FloatArray) -> FloatArray:
-    """Return the logarithms (G,) of the shares of the motions in a path: a mixture, fitted by EM.
+def _smooth_covariance(times_s: FloatArray) -> FloatArray:
+    """Return the covariance (2K,2K) of an acceleration that is integrated twice, per `_FRAME_S`^4.
+
+    The acceleration has the Matérn covariance (3/2) with the time `_SMOOTH_S` and a variance of 1.
+
+    Args:
+        times_s: (2K,) times of the frames after the first one, seconds.
+    """
+    instants = np.arange(0.0, times_s[-1], _INTEGRATION_S)
+    apart = np.sqrt(3.0) * np.abs(instants[:, None] - instants) / _SMOOTH_S
+    integral = np.clip(times_s[:, None] - instants, 0.0, None) * _INTEGRATION_S
+    return np.asarray(integral @ ((1.0 + apart) * np.exp(-apart)) @ integral.T / _FRAME_S**4)
+
+
+def _occurrence(smooth: FloatArray) -> FloatArray:
+    """Return the probabilities (W,G) of the motions in each window: a mixture, fitted by EM.
 
     Args:
         smooth: (W,G) log-likelihood of each window and motion.
@@ -323,10 +356,32 @@ def _motion_weights(smooth: FloatArray) -> FloatArray:
     size = smooth.shape[1]
     weights = np.full(size, -np.log(size))
     for _ in range(_EM_ITERATIONS):
-        posterior = smooth + weights
-        shares = np.exp(posterior - logsumexp(posterior, axis=1, keepdims=True)).mean(axis=0)
-        weights = np.log((1.0 - _FREE_SHARE) * shares + _FREE_SHARE / size)
-    return weights
+        probability = smooth + weights
+        probability = np.exp(probability - logsumexp(probability, axis=1, keepdims=True))
+        weights = _log_shares(probability.mean(axis=0))
+    return np.asarray(probability)
+
+
+def _log_shares(shares: FloatArray) -> FloatArray:
+    return np.asarray(np.log((1.0 - _FREE_SHARE) * shares + _FREE_SHARE / shares.shape[-1]))
+
+
+def _weights_elsewhere(windows: IntArray, sample: IntArray, occurrence: FloatArray) -> FloatArray:
+    """Return the logarithms (W,G) of the shares of the motions in the path without each window.
+
+    The windows that contain a slip do not show how the limb usually moves.
+
+    Args:
+        windows: (W,) numbers of the windows.
+        sample: (S,) numbers of the windows whose motions are known, increasing.
+        occurrence: (S,G) probabilities of the motions in these windows.
+    """
+    around = _HALF_FRAMES + _MAX_TRANSITION_FRAMES
+    first, last = np.searchsorted(sample, windows - around), np.searchsorted(sample, windows + around + 1)
+    total = np.vstack([np.zeros(occurrence.shape[1]), np.cumsum(occurrence, axis=0)])
+    # Without other windows, each motion is as likely as any other.
+    rest = total[-1] - (total[last] - total[first]) + 1e-6
+    return _log_shares(rest / rest.sum(axis=1, keepdims=True))
 
 
 def _both_parts(windows: _Windows, wrong: BoolArray | None = None) -> list[_Likelihoods]:
@@ -341,7 +396,7 @@ def _slip_evidence(windows: _Windows, weights: Sequence[FloatArray]) -> FloatArr
 
     Args:
         windows: The windows.
-        weights: Log of the shares of the motions, for rotation and translation.
+        weights: (W,G) log of the shares of the motions, for rotation and translation.
 
     Returns:
         The ratios for D durations of the slip, see `_transitions`.
@@ -367,7 +422,10 @@ def _slip_evidence(windows: _Windows, weights: Sequence[FloatArray]) -> FloatArr
 
 
 def _wrong_frames_evidence(window: _Windows, weights: Sequence[FloatArray]) -> float:
-    """Return the log of the ratio of the likelihoods of some wrong frames beside the instant, and of none."""
+    """Return the log of the ratio of the likelihoods of a smooth motion with and without wrong frames.
+
+    Some frames beside the instant may be wrong, or none.
+    """
     frames = np.arange(2 * _HALF_FRAMES)
     blocks = [np.zeros(len(frames), dtype=np.bool_)]
     for length in range(1, _HALF_FRAMES):
@@ -380,13 +438,15 @@ def _wrong_frames_evidence(window: _Windows, weights: Sequence[FloatArray]) -> f
         )
         for block in blocks
     ]
-    return max(total) - total[0]
+    some = logsumexp(total[1:]) - np.log(len(total) - 1)
+    return float(np.logaddexp(0.0, some - total[0]))
 
 
 def _is_along_path(track: CameraTrack, step: _Step, stride: int) -> bool:
-    """Return True if a step is what the camera moves in a few frame intervals.
+    """Return True if a step is rather what the camera moves in a few frame intervals than a slip.
 
-    Such a step comes from frames that the recording lacks although its timestamps do not show it.
+    Such a step comes from frames that the recording lacks although its timestamps do not show it. The
+    likelihoods of both are compared. A slip turns the camera, or moves it, or both.
 
     Args:
         track: Path of the camera.
@@ -394,15 +454,26 @@ def _is_along_path(track: CameraTrack, step: _Step, stride: int) -> bool:
         stride: Number of frames of the track for each frame that is compared.
     """
     index = step.first_after + stride * np.arange(-_HALF_FRAMES // 2, _HALF_FRAMES // 2)
-    moves = invert(track.map_from_cam[index[:-1]]) @ track.map_from_cam[index[1:]]
-    scales = np.repeat(_STEP_SIGMAS, 3)
-    twists = np.hstack([so3_log(moves[:, :3, :3]), moves[:, :3, 3]]) / scales
-    velocity = np.median(np.delete(twists, _HALF_FRAMES // 2 - 1, axis=0), axis=0)
-    change = (
-        np.hstack([so3_log(step.before_from_after[None, :3, :3])[0], step.before_from_after[:3, 3]]) / scales
-    )
-    intervals = float(np.clip(velocity @ change / max(velocity @ velocity, 1e-12), *_MISSING_INTERVALS))
-    return bool(np.linalg.norm(change - intervals * velocity) < 0.5 * np.linalg.norm(change))
+    moves = _twists(invert(track.map_from_cam[index[:-1]]) @ track.map_from_cam[index[1:]])
+    moves = np.delete(moves, _HALF_FRAMES // 2 - 1, axis=0)
+    velocity = np.median(moves, axis=0)
+    spread = ((moves - velocity) ** 2).mean(axis=0).reshape(2, 3).mean(axis=1)
+    intervals = np.linspace(*_MISSING_INTERVALS, _INTERVALS)[:, None]
+    kinds = np.array([[1.0, 1.0], [1.0, 0.0], [0.0, 1.0]])
+
+    def log_likelihood(means: FloatArray, variances: FloatArray) -> float:
+        variances = np.repeat(variances + np.array([step.sigma_rad, step.sigma_m]) ** 2, 3, axis=1)
+        square = (_twists(step.before_from_after[None]) - means) ** 2 / variances
+        values = -0.5 * (square + np.log(variances)).sum(axis=1)
+        return float(logsumexp(values) - np.log(len(values)))
+
+    along = log_likelihood(intervals * velocity, intervals**2 * spread)
+    return along > log_likelihood(np.zeros(6), kinds * np.array(_STEP_SIGMAS) ** 2)
+
+
+def _twists(poses: FloatArray) -> FloatArray:
+    """Return the rotation vectors and translations (N,6) of poses (N,4,4)."""
+    return np.hstack([so3_log(poses[:, :3, :3]), poses[:, :3, 3]])
 
 
 def _peaks(evidence: FloatArray) -> list[int]:
@@ -427,12 +498,12 @@ def _mean_step(
     Args:
         first_after: Index of the first frame after the step.
         found: Likelihoods of rotation and translation in this one window; the translation is the pivot's.
-        weights: Log of the shares of the motions, for rotation and translation.
+        weights: (1,G) log of the shares of the motions, for rotation and translation.
         pivot_in_cam: (4,4) axes of the camera at the pivot, in the camera's frame.
     """
     means, sigmas = [], []
     for each, weight in zip(found, weights, strict=True):
-        slipped, steps = each.slipped[0] + weight, each.step[0]
+        slipped, steps = each.slipped[0] + weight[0], each.step[0]
         share = np.exp(slipped - logsumexp(slipped))
         mean = share @ steps
         spread = ((steps - mean) ** 2).mean(axis=1)

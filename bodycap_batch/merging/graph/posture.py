@@ -45,6 +45,10 @@ _MIN_PATH_WIDTH_M = 0.3
 ten steps with a bounce of 2 cm tilt the fitted plane by one degree."""
 _MAX_BODY_ANGLE_RAD = float(np.radians(30.0))
 """Maximum angle (radians) between the path's vertical and the body's vertical. Evidence: none."""
+_STEP_M = 0.7
+"""Length (metres) of a path over which the height of a walking trunk varies once. Derivation: a step."""
+_FIT_ITERATIONS = 15
+"""Number of iterations of the robust fit of a path's plane. Evidence: none."""
 _MAX_SAMPLES = 300
 """Maximum number of instants at which the speed is evaluated. It bounds the computing time."""
 
@@ -180,7 +184,7 @@ def vertical_from_path(path_m: FloatArray, body_up: FloatArray) -> FloatArray | 
     """
     weight = np.ones(len(path_m))
     normal = np.asarray(body_up, dtype=np.float64)
-    for _ in range(15):
+    for _ in range(_FIT_ITERATIONS):
         centred = path_m - np.average(path_m, axis=0, weights=weight)
         normal = np.linalg.svd(centred * np.sqrt(weight)[:, None], full_matrices=False)[2][2]
         weight = 1.0 / (1.0 + (centred @ normal / _BOUNCE_M) ** 2)
@@ -193,3 +197,32 @@ def vertical_from_path(path_m: FloatArray, body_up: FloatArray) -> FloatArray | 
     if sigmas[1] < _MIN_PATH_WIDTH_M or normal @ body_up < np.cos(_MAX_BODY_ANGLE_RAD):
         return None
     return np.asarray(normal)
+
+
+def path_slopes(path_m: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fit the slope of a trunk's path. The trunk may be lower for some of the time, because the person bends.
+
+    Args:
+        path_m: (N,3) positions of the trunk, metres.
+        up: (3,) vertical.
+
+    Returns:
+        Slopes (2,) along the two principal horizontal axes of the path, variances (2,) of the slopes by the
+        bounce of the steps, and these axes (2,3).
+    """
+    centred = path_m - path_m.mean(axis=0)
+    across = centred - np.outer(centred @ up, up)
+    # The vertical is the eigenvector with the smallest eigenvalue, -1.
+    spread, vectors = np.linalg.eigh(across.T @ across / len(across) - np.outer(up, up))
+    axes = vectors[:, 1:].T
+    design = np.column_stack([across @ axes.T, np.ones(len(across))])
+    height = centred @ up
+    weight = np.ones(len(across))
+    for _ in range(_FIT_ITERATIONS):
+        weighted = design.T * weight
+        slopes = np.linalg.solve(weighted @ design + 1e-9 * np.eye(3), weighted @ height)
+        off = height - design @ slopes
+        weight = 1.0 / (1.0 + (off / _BOUNCE_M) ** 2)
+    steps = max(1.0, float(np.linalg.norm(np.diff(across, axis=0), axis=1).sum()) / _STEP_M)
+    variance = float(weight @ off**2 / weight.sum()) / steps
+    return slopes[:2], variance / np.maximum(spread[1:], 1e-9), axes

@@ -8,13 +8,13 @@ terms are set by hand.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.trunk_lean import TrunkOrientation
-from bodycap_batch.merging.graph.posture import vertical_from_path
+from bodycap_batch.merging.graph.posture import path_slopes, vertical_from_path
 from bodycap_batch.merging.world.planes import (
     BENT_TILT_LIMIT_DEG,
     PLANE_HALF_THICKNESS_M,
@@ -68,6 +68,11 @@ _MIN_PLANE_SIGMA_DEG, _WALK_SIGMA_DEG, _BODY_SIGMA_DEG = 0.7, 2.0, 15.0
 Second: sigma of a vertical from the walk. The path of a walking trunk is horizontal to two degrees. Third:
 minimum sigma of a vertical from the body of a walker. This sigma allows for an error of the camera's mount,
 which looks like a tilt of the body."""
+_LEVEL_SIGMA_DEG = 0.6
+"""Sigma (degrees) of the slope of a floor on which a person walks, along each axis. Derivation: 1 %, as
+streets and floors with a drain."""
+_SLOPING_DEG, _SLOPING_ODDS = 10.0, 0.1
+"""First: sigma of the slope of stairs and ramps. Second: odds that a person walks on them. Evidence: none."""
 _PLANE_SIGMA_LIMIT_DEG = 1.5
 """Maximum misalignment (degrees) of a plane that is used for the sigma of a vertical. Evidence: none."""
 
@@ -214,6 +219,8 @@ def estimate_vertical(
     ]
     stated_sources = {each.source for each in stated}
     selected = _select(hypotheses, stated_sources)
+    if scene.walks and selected.source == "map":
+        selected = _levelled(selected, scene.path_m)
     return _vertical_from_hypotheses(selected, hypotheses, stated_sources, upright)
 
 
@@ -240,6 +247,34 @@ def _select(hypotheses: Sequence[VerticalHypothesis], stated: Collection[str]) -
         and (not measured or each.sigma_deg < best.sigma_deg)
     ]
     return min(agreeing, key=_cost, default=best)
+
+
+def _levelled(vertical: VerticalHypothesis, path_m: FloatArray) -> VerticalHypothesis:
+    """Return a vertical that is combined with the slope of a walk, because most floors are level.
+
+    Along each principal axis of the path, the slope of the path is a measurement of the error of the
+    vertical. Its variance contains that of floors, and that of the bounce of the trunk. The slope counts by
+    the probability that the floor is level.
+
+    Args:
+        vertical: The vertical, and its sigma.
+        path_m: (N,3) positions of the trunk's camera in the solved frame of reference.
+    """
+    slopes, variances, axes = path_slopes(path_m, vertical.up)
+    before, level, sloping = (
+        np.radians(each) ** 2 for each in (vertical.sigma_deg, _LEVEL_SIGMA_DEG, _SLOPING_DEG)
+    )
+    measured = before + variances + level
+    anywhere = before + variances + sloping
+    odds = _SLOPING_ODDS * np.sqrt(measured / anywhere)
+    odds = odds * np.exp(0.5 * slopes**2 * (1.0 / measured - 1.0 / anywhere))
+    gain = before / measured / (1.0 + odds)
+    up = vertical.up - (gain * slopes) @ axes
+    return replace(
+        vertical,
+        up=up / np.linalg.norm(up),
+        sigma_deg=vertical.sigma_deg * float(np.sqrt(1.0 - gain.mean())),
+    )
 
 
 def _vertical_from_hypotheses(

@@ -104,6 +104,17 @@ def test_frames_that_a_recording_lacks_are_no_slip() -> None:
     assert find_slip(replace(lacking, times_ns=track.times_ns[: count - 2])) is None
 
 
+def test_a_slip_along_the_path_without_the_turn_of_the_limb_is_found() -> None:
+    track = _arm()
+    before = round(30 * SLIP_S) - 1
+    ahead = (invert(track.map_from_cam[before - 1]) @ track.map_from_cam[before])[:3, 3]
+    step = make_transform(np.eye(3), 0.03 * ahead / np.linalg.norm(ahead))
+    slip = find_slip(_with_step(track, step, SLIP_S))
+    assert slip is not None
+    # 4 sigma per axis bound the length of an error with three axes in 99.9 % of the cases.
+    assert np.linalg.norm((invert(step) @ slip.before_from_after)[:3, 3]) < 4.0 * slip.sigma_m
+
+
 def test_a_short_path_has_no_slip() -> None:
     track = _arm()
     assert find_slip(track.keep(np.arange(len(track.times_ns)) < 5)) is None

@@ -76,6 +76,34 @@ def test_a_bending_person_does_not_turn_the_room_on_its_side(forward_deg, share)
     assert found.is_determined()
 
 
+def _walk(rng, slope_deg):
+    """Return axes (N,3,3) and path (N,3) of a trunk that walks 4 m along +X, up a slope."""
+    axes, _ = _leaning(rng, 0.0, 1.0)
+    ahead = np.linspace(-2.0, 2.0, 200)
+    bounce = 0.02 * np.sin(2.0 * np.pi * ahead / 0.7)
+    return axes, np.column_stack(
+        [ahead, np.zeros(200), STANDING_M + bounce + np.tan(np.radians(slope_deg)) * ahead]
+    )
+
+
+def test_a_level_walk_halves_the_error_of_the_planes():
+    rng = np.random.default_rng(1)
+    tilted = _box_room(rng) @ so3_exp([0.0, np.radians(1.0), 0.0]).T
+    found = _found(*_walk(rng, 0.0), tilted, walks=True)
+    assert found.source == "map"
+    # Variances in square degrees: 0.5 of the planes, 0.36 of floors, 0.04 of the bounce.
+    assert 0.35 < _off_deg(found) < 0.6
+    # The planes alone have 0.7 degrees, and still have across the path.
+    assert 0.55 < found.sigma_deg < 0.66
+
+
+def test_a_walk_on_a_ramp_does_not_tilt_the_room():
+    rng = np.random.default_rng(1)
+    found = _found(*_walk(rng, 6.0), _box_room(rng), walks=True)
+    assert found.source == "map"
+    assert _off_deg(found) < 0.1
+
+
 def test_a_room_seen_from_one_side_is_not_turned_on_its_side():
     rng = np.random.default_rng(1)
     room = _box_room(rng)
