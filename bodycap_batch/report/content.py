@@ -14,15 +14,11 @@ from bodycap_batch.report.advice import recommend_changes
 from bodycap_batch.report.drawn_scene import DrawnScene, common_times_s
 from bodycap_batch.report.figures.before_after import draw_before_and_after, find_unoptimised_bones
 from bodycap_batch.report.figures.camera_landmark_matrix import draw_camera_landmark_matrix
-from bodycap_batch.report.figures.camera_timeline import (
-    MAX_COLUMNS,
-    column_count,
-    draw_camera_timeline,
-    draw_coverage,
-)
+from bodycap_batch.report.figures.camera_timeline import draw_camera_timeline, draw_coverage
 from bodycap_batch.report.figures.motion_curves import Take, draw_motion_curves
 from bodycap_batch.report.figures.pictogram import draw_pictogram
 from bodycap_batch.report.figures.shared_landmarks import draw_shared_landmarks
+from bodycap_batch.report.figures.time_axis import MAX_COLUMNS, column_count
 from bodycap_batch.report.grades import Grade
 from bodycap_batch.report.loss_causes import CAUSES, LossCause
 from bodycap_batch.report.loss_diagnosis import DiagnosedLoss, count_frames_by_cause

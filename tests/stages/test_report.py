@@ -27,7 +27,8 @@ from bodycap_batch.report import ReportInputs
 from bodycap_batch.report.advice import count_shared_points, recommend_changes
 from bodycap_batch.report.drawn_scene import common_times_s, make_drawn_scene
 from bodycap_batch.report.figures.before_after import find_unoptimised_bones
-from bodycap_batch.report.figures.camera_timeline import draw_camera_timeline, x_from_time
+from bodycap_batch.report.figures.camera_timeline import draw_camera_timeline
+from bodycap_batch.report.figures.time_axis import x_from_time
 from bodycap_batch.report.frame_losses import (
     find_frame_losses,
     likely_cause,
