@@ -26,7 +26,8 @@ from bodycap_batch.report.figures.time_axis import (
     draw_strip,
     x_from_time,
 )
-from bodycap_batch.report.frame_losses import FrameLoss, turn_per_frame_deg
+from bodycap_batch.report.frame_losses import turn_per_frame_deg
+from bodycap_batch.report.loss_causes import LostSpan
 from bodycap_batch.report.report_inputs import ReportInputs
 
 _TOP, _STATUS_HEIGHT, _CURVE_HEIGHT, _MARGIN = 4.0, 18.0, 44.0, 10.0
@@ -74,7 +75,7 @@ def draw_camera_timeline(
     inputs: ReportInputs,
     camera: str,
     span_s: Span,
-    losses: list[FrameLoss],
+    losses: list[LostSpan],
     bridged_s: float,
     detail: float = 1.0,
 ) -> str:
@@ -117,7 +118,7 @@ def draw_camera_timeline(
 
 
 def draw_coverage(
-    path: Trajectory, times_s: FloatArray, span_s: Span, losses: list[FrameLoss], bridged_s: float
+    path: Trajectory, times_s: FloatArray, span_s: Span, losses: list[LostSpan], bridged_s: float
 ) -> str:
     """Draw the intervals in which a camera has poses, as one bar that can be stretched to any width.
 
@@ -206,7 +207,7 @@ def _draw_bars(
     path: Trajectory,
     times: FloatArray,
     span_s: Span,
-    losses: list[FrameLoss],
+    losses: list[LostSpan],
     bridged_s: float,
     columns: int = MAX_COLUMNS,
 ) -> str:
@@ -220,9 +221,9 @@ def _draw_bars(
     lost = [
         _StatusBar(
             _loss_kind(loss, times, bridged_s),
-            loss.start_s,
-            loss.end_s + interval,
-            loss.frame_count,
+            loss.from_s,
+            loss.to_s + interval,
+            loss.frames,
             (loss.reason.value,),
         )
         for loss in losses
@@ -234,7 +235,7 @@ def _draw_bars(
     )
 
 
-def _loss_kind(loss: FrameLoss, times: FloatArray, bridged_s: float) -> str:
+def _loss_kind(loss: LostSpan, times: FloatArray, bridged_s: float) -> str:
     if loss.reason is FrameStatus.OTHER_MAP:
         return "other"
     if loss.reason is FrameStatus.ROTATION_ONLY:
