@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.model.measured_parts import BODY_PARTS, PartState, overall_state, part_states
 from bodycap_batch.model.merge_data import MergeResult, filled_joints
 from bodycap_batch.report.advice import recommend_changes
@@ -160,7 +161,8 @@ def _cameras(
         own = [loss for loss in losses if loss.camera == name]
         bridged_s = inputs.max_gap_s if name in in_body else 0.0
         path = inputs.path(name)
-        bar, registered = "", np.zeros(0, dtype=bool)
+        bar = ""
+        registered: BoolArray = np.zeros(0, dtype=np.bool_)
         if path is not None and len(path.times_ns):
             bar = draw_coverage(path, common_times_s(inputs, name, path.times_ns), span_s, own, bridged_s)
             registered = path.registered
@@ -188,7 +190,7 @@ def _time_span(inputs: ReportInputs) -> Span:
     ends: list[float] = []
     for name in inputs.cameras:
         path = inputs.path(name)
-        times = np.zeros(0)
+        times: FloatArray = np.zeros(0)
         if path is not None and len(path.times_ns):
             times = common_times_s(inputs, name, path.times_ns)
         elif inputs.capture is not None:
