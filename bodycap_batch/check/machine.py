@@ -107,7 +107,7 @@ def examine_machine(folder: Path) -> Iterator[MachineFinding]:
             f"if you need {purpose}, run: pip install 'bodycap-batch[{extra}]'" if missing else "",
         )
     yield _blender_finding()
-    browser = next((place for name in _BROWSERS if (place := shutil.which(name))), None)
+    browser = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
     yield _finding(
         "a browser",
         browser or "not found",

@@ -194,7 +194,7 @@ def _time_span(inputs: ReportInputs) -> Span:
         if path is not None and len(path.times_ns):
             times = common_times_s(inputs, name, path.times_ns)
         elif inputs.capture is not None:
-            times = inputs.capture.camera(name).common_times_ns() * 1e-9
+            times = np.asarray(inputs.capture.camera(name).common_times_ns() * 1e-9, dtype=np.float64)
         ends += times[[0, -1]].tolist() if len(times) else []
     return (min(ends), max(ends)) if ends else (0.0, 1.0)
 
