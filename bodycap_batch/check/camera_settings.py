@@ -13,6 +13,7 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.capture.lens_choice import video_mode
 from bodycap_batch.capture.video import open_container
 from bodycap_batch.config.calibration import NOTED_RMS_RATIO, CalibratedWith, Calibration, max_rms_px
+from bodycap_batch.config.models import CameraConfig
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.formats.gpmf import gopro_settings, gopro_stabilisation
 from bodycap_batch.model.picture_turns import stabilisation_note
@@ -62,13 +63,16 @@ def setting_notes(camera: CaptureCamera, *, stabilised: bool | None = None) -> l
     ]
 
 
-def calibration_notes(calibration: Calibration, camera: CaptureCamera) -> list[str]:
+def calibration_notes(config: CameraConfig, camera: CaptureCamera) -> list[str]:
     """Return notes on a given calibration that contradicts the video, or whose own report is bad.
 
     Args:
-        calibration: The calibration.
+        config: The camera in the job.
         camera: The camera, with the intrinsics of the calibration at the work size.
     """
+    calibration = config.calibration
+    if not isinstance(calibration, Calibration):
+        return []
     size, video = (calibration.width, calibration.height), camera.videos[0]
     made = calibration.calibrated_with or CalibratedWith()
     mode = video_mode(video.path)
@@ -117,13 +121,11 @@ def _stabilisation_notes(path: Path) -> list[str]:
 
 
 def _gopro_notes(settings: dict[str, str]) -> list[str]:
-    notes = []
-    if settings.get("DZOM", "N").upper() not in _OFF_VALUES:
-        notes.append(
-            "the video was filmed with digital zoom: film without zoom, or calibrate the camera at the "
-            "same zoom"
-        )
-    return notes
+    if settings.get("DZOM", "N").upper() in _OFF_VALUES:
+        return []
+    return [
+        "the video was filmed with digital zoom: film without zoom, or calibrate the camera at the same zoom"
+    ]
 
 
 def _phone_notes(path: Path) -> list[str]:

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib import metadata, util
@@ -30,6 +30,8 @@ The map stage needs 2 to 3 GB for such a capture. Evidence: docs/decisions/check
 """
 _ENOUGH_DISK_MB = 5000
 """Free disk space (megabytes) that suffices for a usual job. Evidence: none."""
+_LEAST_DISK_MB = 500
+"""Free disk space (megabytes) with which jobs fail. Evidence: none."""
 _LIBRARIES = {
     "numpy": "numpy",
     "scipy": "scipy.optimize",
@@ -83,80 +85,72 @@ def examine_machine(folder: Path) -> Iterator[MachineFinding]:
     Args:
         folder: Folder in which results will be written. It need not exist.
     """
+    place = _nearest_existing(folder)
     yield _python_finding()
-    yield _processor_finding()
+    yield _finding(
+        "processors",
+        f"{cores()}; no GPU is used" if cores() > 1 else "one",
+        "" if cores() > 1 else "use a machine with two processors, if you can: jobs then run twice as fast",
+    )
     yield _memory_finding()
     # Each import runs in a separate process. If a library crashes, this process continues.
     with ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1)) as pool:
         yield from pool.map(_library_finding, _LIBRARIES)
     yield _video_finding()
-    yield _disk_finding(folder)
-    yield _writing_finding(folder)
-    for extra in _EXTRAS:
-        yield _extra_finding(extra)
+    yield _disk_finding(place)
+    yield _writing_finding(place)
+    for extra, (modules, purpose) in _EXTRAS.items():
+        missing = [module for module in modules if util.find_spec(module) is None]
+        yield _finding(
+            f"extra [{extra}]",
+            f"not installed: {', '.join(missing)}" if missing else purpose,
+            f"if you need {purpose}, run: pip install 'bodycap-batch[{extra}]'" if missing else "",
+        )
     yield _blender_finding()
-    yield _program_finding(
+    browser = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
+    yield _finding(
         "a browser",
-        _BROWSERS,
-        "install Chromium or use any other browser to open report.html and to play preview.mp4",
+        browser or "not found",
+        ""
+        if browser
+        else "install Chromium or use any other browser to open report.html and to play preview.mp4",
     )
+
+
+def _finding(what: str, found: str, remedy: str = "", *, is_problem: bool = False) -> MachineFinding:
+    """Return a finding: what has no remedy is ok, otherwise it is a problem or a note."""
+    state: State = "ok" if not remedy else "problem" if is_problem else "note"
+    return MachineFinding(what=what, state=state, found=found, remedy=remedy)
 
 
 def _python_finding() -> MachineFinding:
-    version = sys.version_info[:2]
     found = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
-    if _PYTHON_VERSIONS[0] <= version < _PYTHON_VERSIONS[1]:
-        return MachineFinding(what="Python", state="ok", found=found)
-    return MachineFinding(what="Python", state="problem", found=found, remedy="use Python 3.11, 3.12 or 3.13")
-
-
-def _processor_finding() -> MachineFinding:
-    count = cores()
-    if count > 1:
-        return MachineFinding(what="processors", state="ok", found=f"{count}; no GPU is used")
-    return MachineFinding(
-        what="processors",
-        state="note",
-        found="one",
-        remedy="use a machine with two processors, if you can: jobs then run twice as fast",
-    )
+    supported = _PYTHON_VERSIONS[0] <= sys.version_info[:2] < _PYTHON_VERSIONS[1]
+    return _finding("Python", found, "" if supported else "use Python 3.11, 3.12 or 3.13", is_problem=True)
 
 
 def _memory_finding() -> MachineFinding:
-    total_mb = _total_memory_mb()
-    if total_mb is None:
-        return MachineFinding(
-            what="memory",
-            state="note",
-            found="unknown",
-            remedy=f"jobs need {_ENOUGH_MEMORY_MB / 1000:g} GB of memory",
-        )
-    found = f"{total_mb / 1000:.1f} GB"
-    if total_mb >= _ENOUGH_MEMORY_MB:
-        return MachineFinding(what="memory", state="ok", found=found)
-    remedy = (
-        "shorten long captures with start_s and end_s, or lower work_px: long captures need "
-        f"{_ENOUGH_MEMORY_MB / 1000:g} GB"
-    )
-    return MachineFinding(what="memory", state="note", found=found, remedy=remedy)
-
-
-def _total_memory_mb() -> int | None:
-    """Return the memory of this machine in megabytes (1 MB = 10⁶ bytes); None if it is unknown."""
+    enough = f"{_ENOUGH_MEMORY_MB / 1000:g} GB"
     try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 10**6
+        total_mb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 10**6
     except (ValueError, OSError, AttributeError):
-        return None
+        return _finding("memory", "unknown", f"jobs need {enough} of memory")
+    remedy = (
+        f"shorten long captures with start_s and end_s, or lower work_px: long captures need {enough}"
+        if total_mb < _ENOUGH_MEMORY_MB
+        else ""
+    )
+    return _finding("memory", f"{total_mb / 1000:.1f} GB", remedy)
 
 
 def _library_finding(name: str) -> MachineFinding:
     failure = _error_of_code(f"import zlib, {_LIBRARIES[name]}")
     if failure is None:
-        return MachineFinding(what=name, state="ok", found=_installed_version(name))
+        return _finding(name, _installed_version(name))
     remedy = "run make setup (or pip install -r requirements.lock)"
     if ".so" in failure:
         remedy = f"install the missing system library: {_SYSTEM_PACKAGES}"
-    return MachineFinding(what=name, state="problem", found=failure, remedy=remedy)
+    return _finding(name, failure, remedy, is_problem=True)
 
 
 def _error_of_code(code: str) -> str | None:
@@ -194,31 +188,29 @@ def _video_finding() -> MachineFinding:
     code = "import av; assert 'libx264' in av.codecs_available; av.Codec('h264', 'r'); av.Codec('hevc', 'r')"
     failure = _error_of_code(code)
     if failure is None:
-        return MachineFinding(what="video", state="ok", found="reads H.264 and H.265, writes H.264")
+        return _finding("video", "reads H.264 and H.265, writes H.264")
     remedy = "install PyAV from its wheel: pip install --force-reinstall av"
-    return MachineFinding(what="video", state="problem", found=failure, remedy=remedy)
+    return _finding("video", failure, remedy, is_problem=True)
 
 
-def _disk_finding(folder: Path) -> MachineFinding:
-    place = _nearest_existing(folder)
+def _disk_finding(place: Path) -> MachineFinding:
     free_mb = shutil.disk_usage(place).free // 10**6
-    found = f"{free_mb / 1000:.1f} GB free at {place}"
-    if free_mb >= _ENOUGH_DISK_MB:
-        return MachineFinding(what="disk", state="ok", found=found)
     remedy = (
         "free some space (`bodycap gc` removes old artefacts), or choose another disk with --out and --store"
     )
-    return MachineFinding(
-        what="disk", state="note" if free_mb > 500 else "problem", found=found, remedy=remedy
+    return _finding(
+        "disk",
+        f"{free_mb / 1000:.1f} GB free at {place}",
+        remedy if free_mb < _ENOUGH_DISK_MB else "",
+        is_problem=free_mb <= _LEAST_DISK_MB,
     )
 
 
-def _writing_finding(folder: Path) -> MachineFinding:
+def _writing_finding(place: Path) -> MachineFinding:
     """Check whether files can be written, renamed and hard-linked in a folder.
 
     These operations are used to publish results. If hard links are impossible, results are copied.
     """
-    place = _nearest_existing(folder)
     try:
         with tempfile.TemporaryDirectory(dir=place, prefix=".bodycap-doctor-") as scratch:
             first = Path(scratch) / "first"
@@ -227,15 +219,11 @@ def _writing_finding(folder: Path) -> MachineFinding:
             linked = _can_hard_link(Path(scratch) / "second", Path(scratch) / "third")
     except OSError as error:
         remedy = "choose a folder in which you may write (--out, --store)"
-        return MachineFinding(
-            what="writing", state="problem", found=f"{place}: {error.strerror}", remedy=remedy
-        )
+        return _finding("writing", f"{place}: {error.strerror}", remedy, is_problem=True)
     if linked:
-        return MachineFinding(
-            what="writing", state="ok", found=f"{place} supports files, renames and hard links"
-        )
+        return _finding("writing", f"{place} supports files, renames and hard links")
     remedy = "no action needed: results are copied from the store and take twice the space"
-    return MachineFinding(what="writing", state="note", found=f"{place} has no hard links", remedy=remedy)
+    return _finding("writing", f"{place} has no hard links", remedy)
 
 
 def _can_hard_link(source: Path, target: Path) -> bool:
@@ -254,30 +242,11 @@ def _nearest_existing(folder: Path) -> Path:
     return folder
 
 
-def _extra_finding(name: str) -> MachineFinding:
-    modules, purpose = _EXTRAS[name]
-    missing = [module for module in modules if util.find_spec(module) is None]
-    if not missing:
-        return MachineFinding(what=f"extra [{name}]", state="ok", found=purpose)
-    remedy = f"if you need {purpose}, run: pip install 'bodycap-batch[{name}]'"
-    return MachineFinding(
-        what=f"extra [{name}]", state="note", found=f"not installed: {', '.join(missing)}", remedy=remedy
-    )
-
-
 def _blender_finding() -> MachineFinding:
     """Look for Blender with the search of the exporter, and start it as the exporter does."""
     try:
-        found = f"{require_blender()} (writes FBX and .blend files)"
-        return MachineFinding(what="Blender", state="ok", found=found)
+        return _finding("Blender", f"{require_blender()} (writes FBX and .blend files)")
     except JobError as error:
         place = "" if error.path is None else f"{error.path}: "
         remedy = f"if you need FBX files (Maya, MotionBuilder, Unreal, Unity) or .blend files, {error.hint}"
-        return MachineFinding(what="Blender", state="note", found=place + error.message, remedy=remedy)
-
-
-def _program_finding(what: str, names: Sequence[str], purpose: str) -> MachineFinding:
-    found = next((place for name in names if (place := shutil.which(name))), None)
-    if found:
-        return MachineFinding(what=what, state="ok", found=found)
-    return MachineFinding(what=what, state="note", found="not found", remedy=purpose)
+        return _finding("Blender", place + error.message, remedy)

@@ -13,7 +13,7 @@ from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.capture.images import Image
 from bodycap_batch.capture.video import COPY_AGAIN, spherical_error
 from bodycap_batch.check.spherical_pictures import is_sphere, sphere_differences
-from bodycap_batch.check.static_pictures import has_one_view, is_static, reduced_picture, static_notes
+from bodycap_batch.check.static_pictures import has_one_view, reduced_picture, static_part
 from bodycap_batch.core.arrays import FloatArray, IntArray, evenly_spaced
 from bodycap_batch.core.errors import CaptureError
 
@@ -91,19 +91,17 @@ def check_picture_quality(camera: CaptureCamera) -> PictureQuality:
             path=camera.chapters[0],
             hint=f"copy the video again, or leave camera {camera.name} out",
         )
-    dark, bright = [], []
-    grey, corners = [], []
-    indices, reduced_pictures = [], []
+    indices: list[int] = []
+    reduced_pictures: list[FloatArray] = []
     edges: list[FloatArray] = []
+    corner_counts: list[float] = []
+    greys: list[FloatArray] = []
     width, height = camera.videos[0].shown_size
     for index, image in camera.read_decodable(sample_indices(camera, _SAMPLES)):
-        low, high = np.percentile(image, (1, 99))
-        dark.append(float(low))
-        bright.append(float(high))
         indices.append(index)
         reduced_pictures.append(reduced_picture(image))
-        grey.append(float(np.median(image)))
-        corners.append(_corner_count(image))
+        corner_counts.append(_corner_count(image))
+        greys.append(np.percentile(image, (1, 50, 99)))
         if width == 2 * height:
             edges.append(sphere_differences(image))
     if not indices:
@@ -116,7 +114,8 @@ def check_picture_quality(camera: CaptureCamera) -> PictureQuality:
         raise spherical_error(
             camera.chapters[0], "equirectangular, because the left edge continues the right edge"
         )
-    black = int(np.sum(np.array(bright) < _MAX_BLACK_GREY))
+    dark, median, bright = np.array(greys).T
+    black = int(np.sum(bright < _MAX_BLACK_GREY))
     if black == len(bright):
         raise CaptureError(
             f"camera {camera.name} shows only black pictures ({black} of {black} inspected)",
@@ -124,30 +123,43 @@ def check_picture_quality(camera: CaptureCamera) -> PictureQuality:
             hint="if the lens was covered, leave this camera out; if a video player shows other pictures, "
             "convert the video to H.264",
         )
-    notes = []
-    if any(video.is_interlaced for video in camera.videos):
-        notes.append(
-            "the video is interlaced: convert it to full frames first "
-            "(ffmpeg -i in -vf bwdif=send_frame out.mp4)"
-        )
     times_s = camera.common_times_ns() / 1e9
-    length_s = float(times_s[-1] - times_s[0])
-    notes += static_notes(reduced_pictures, times_s[indices], length_s)
-    if black:
-        notes.append(
-            f"{black} of {len(bright)} inspected pictures are black; exclude the black part of the video "
-            "with start_s and end_s"
-        )
-    notes += _tracking_notes(grey, corners)
-    contrast = np.array(bright) - np.array(dark)
-    if float(np.median(contrast)) < _MIN_CONTRAST:
-        notes.append(
-            "the pictures have hardly any contrast, so few features can be tracked: use more light, and "
-            "clean the lens"
-        )
-    return PictureQuality(
-        notes=tuple(notes), is_static=is_static(reduced_pictures, times_s[indices], length_s)
+    static, static_notes = static_part(
+        reduced_pictures, times_s[indices], length_s=float(times_s[-1] - times_s[0])
     )
+    few_corners = sum(count < _MIN_CORNERS for count in corner_counts)
+    lit = median[median >= _MAX_BLACK_GREY]
+    grey = float(np.median(lit)) if len(lit) else np.inf
+    findings = (
+        (
+            any(video.is_interlaced for video in camera.videos),
+            "the video is interlaced: convert it to full frames first "
+            "(ffmpeg -i in -vf bwdif=send_frame out.mp4)",
+        ),
+        *((True, note) for note in static_notes),
+        (
+            black > 0,
+            f"{black} of {len(bright)} inspected pictures are black; exclude the black part of the video "
+            "with start_s and end_s",
+        ),
+        (
+            grey < _MIN_MEDIAN_GREY,
+            f"the pictures are dark (median grey value {grey:.0f} of 255), so the exposure is "
+            "long and movement blurs the picture: film with more light, which helps more than any camera "
+            "setting",
+        ),
+        (
+            few_corners > 1 and 2 * few_corners >= len(corner_counts),
+            f"{few_corners} of {len(corner_counts)} inspected pictures show hardly any texture (plain walls, "
+            "a ceiling, or blur): turn the camera towards furniture, or hang up posters",
+        ),
+        (
+            float(np.median(bright - dark)) < _MIN_CONTRAST,
+            "the pictures have hardly any contrast, so few features can be tracked: use more light, and "
+            "clean the lens",
+        ),
+    )
+    return PictureQuality(notes=tuple(note for is_found, note in findings if is_found), is_static=static)
 
 
 def _corner_count(image: Image) -> float:
@@ -161,30 +173,6 @@ def _corner_count(image: Image) -> float:
 
     detector = cv2.FastFeatureDetector.create(threshold=_FAST_THRESHOLD)
     return len(detector.detect(image)) * 640.0 * 480.0 / image.size
-
-
-def _tracking_notes(grey: list[float], corners: list[float]) -> list[str]:
-    """Return notes on low light and missing texture. Another function reports black pictures.
-
-    Args:
-        grey: Median grey level of each picture.
-        corners: Number of corners in each picture, scaled to 640 x 480 pixels.
-    """
-    out = []
-    lit = [value for value in grey if value >= _MAX_BLACK_GREY]
-    if lit and float(np.median(lit)) < _MIN_MEDIAN_GREY:
-        out.append(
-            f"the pictures are dark (median grey value {np.median(lit):.0f} of 255), so the exposure is "
-            "long and movement blurs the picture: film with more light, which helps more than any camera "
-            "setting"
-        )
-    few_corners = sum(count < _MIN_CORNERS for count in corners)
-    if 2 * few_corners >= len(corners) and few_corners > 1:
-        out.append(
-            f"{few_corners} of {len(corners)} inspected pictures show hardly any texture (plain walls, a "
-            "ceiling, or blur): turn the camera towards furniture, or hang up posters"
-        )
-    return out
 
 
 def sample_indices(camera: CaptureCamera, count: int) -> IntArray:

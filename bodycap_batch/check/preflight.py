@@ -19,7 +19,6 @@ from bodycap_batch.check.overview import with_first_guess
 from bodycap_batch.check.picture_quality import PictureQuality, check_picture_quality, stands_still
 from bodycap_batch.check.recording_advice import advise
 from bodycap_batch.config.bounds import MAX_TICKS
-from bodycap_batch.config.calibration import Calibration
 from bodycap_batch.config.export_targets import export_target
 from bodycap_batch.config.job import load_job_with_origins
 from bodycap_batch.config.models import (
@@ -176,7 +175,6 @@ def _summarise_camera(camera: CaptureCamera, config: CameraConfig, quality: Pict
     steps = np.diff(camera.times_ns)
     median_ns = float(np.median(steps)) if len(steps) else 0.0
     variable = len(steps) > 0 and bool((np.abs(steps - median_ns) > _RATE_TOLERANCE * median_ns).any())
-    duration = float(times_s[-1] - times_s[0])
     return CameraSummary(
         name=camera.name,
         role=config.role,
@@ -199,13 +197,9 @@ def _summarise_camera(camera: CaptureCamera, config: CameraConfig, quality: Pict
             *quality.notes,
             *_dropped_frame_notes(camera, median_ns),
             *setting_notes(camera, stabilised=config.stabilised),
-            *(
-                calibration_notes(config.calibration, camera)
-                if isinstance(config.calibration, Calibration)
-                else []
-            ),
+            *calibration_notes(config, camera),
             *_intrinsics_notes(camera),
-            *_duration_notes(duration),
+            *_duration_notes(float(times_s[-1] - times_s[0])),
         ),
     )
 
@@ -275,14 +269,12 @@ def _dropped_frame_notes(camera: CaptureCamera, usual_ns: float) -> list[str]:
 
 
 def _duration_notes(duration_s: float) -> list[str]:
-    return (
-        [
-            f"the video lasts only {duration_s:.1f} s, which is hardly enough movement for a map: use a "
-            "longer part"
-        ]
-        if duration_s < _MIN_DURATION_S
-        else []
-    )
+    if duration_s >= _MIN_DURATION_S:
+        return []
+    return [
+        f"the video lasts only {duration_s:.1f} s, which is hardly enough movement for a map: use a longer "
+        "part"
+    ]
 
 
 def _body_notes(job: Job) -> list[str]:
@@ -439,10 +431,8 @@ def _check_motion(job: Job, summaries: list[CameraSummary]) -> list[str]:
 
 def _check_disk(job: Job, summaries: list[CameraSummary]) -> list[str]:
     """Check that the disk has space for results and intermediate files, and that files can be written."""
-    frames, large = (
-        sum(camera.used_frames for camera in summaries),
-        sum(camera.large_frames for camera in summaries),
-    )
+    frames = sum(camera.used_frames for camera in summaries)
+    large = sum(camera.large_frames for camera in summaries)
     return require_room(job.out or Path("out").resolve(), frames, large)
 
 

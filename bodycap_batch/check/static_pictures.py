@@ -59,37 +59,32 @@ def reduced_picture(image: Image) -> FloatArray:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float64)
 
 
-def is_static(pictures: Sequence[FloatArray], times_s: FloatArray, length_s: float) -> bool:
-    """Return True if all pictures of a camera are equal and span most of the recording.
-
-    See `static_notes` for the arguments.
-    """
-    start, stop = _longest_static_run(_equal_pictures(pictures), times_s)
-    return _spans_recording(start, stop, times_s, length_s)
-
-
-def static_notes(pictures: Sequence[FloatArray], times_s: FloatArray, length_s: float) -> list[str]:
-    """Return a note if the pictures of a camera do not change; otherwise an empty list.
-
-    The note says that the whole recording is static if all pictures are equal and span most of the recording.
+def static_part(
+    pictures: Sequence[FloatArray], times_s: FloatArray, length_s: float
+) -> tuple[bool, list[str]]:
+    """Find pictures of a camera that do not change.
 
     Args:
         pictures: N reduced pictures in the order of time.
         times_s: (N,) common time of each picture, seconds.
         length_s: Duration of the recording, seconds.
+
+    Returns:
+        True if all pictures are equal and span most of the recording; and a note if pictures do not change
+        for a long time, otherwise an empty list.
     """
     start, stop = _longest_static_run(_equal_pictures(pictures), times_s)
     first, last = times_s[start], times_s[stop]
     step = max(_MIN_STEP_S, _MIN_STEP_RATIO * length_s)
     count = stop - start + 1
-    if _spans_recording(start, stop, times_s, length_s):
-        return [
+    if count == len(times_s) and last - first >= max(step, _MIN_SPAN_RATIO * length_s):
+        return True, [
             "the picture does not change in the whole video: the recording froze, or the camera was not "
             "on the body. This video shows no motion, so record again or leave this camera out"
         ]
     if count < _MIN_RUN_PICTURES or last - first < _MIN_RUN_STEPS * step:
-        return []
-    return [
+        return False, []
+    return False, [
         f"the picture does not change from about {first:.1f} to {last:.1f} s ({count} pictures are equal): "
         "check whether the person stands still, the recording froze, or the camera was not on the body. "
         "To exclude this part, set start_s and end_s"
@@ -98,13 +93,9 @@ def static_notes(pictures: Sequence[FloatArray], times_s: FloatArray, length_s: 
 
 def has_one_view(pictures: Iterable[FloatArray]) -> bool:
     """Return True if all pictures of a camera are equal to the first. It stops at the first other picture."""
-    first: FloatArray | None = None
-    for picture in pictures:
-        if first is None:
-            first = picture
-        elif not _is_same_view(first, picture):
-            return False
-    return True
+    rest = iter(pictures)
+    first = next(rest, None)
+    return first is None or all(_is_same_view(first, picture) for picture in rest)
 
 
 def _equal_pictures(pictures: Sequence[FloatArray]) -> BoolArray:
@@ -113,13 +104,6 @@ def _equal_pictures(pictures: Sequence[FloatArray]) -> BoolArray:
     for one, other in combinations(range(len(pictures)), 2):
         same[one, other] = same[other, one] = _is_same_view(pictures[one], pictures[other])
     return same
-
-
-def _spans_recording(start: int, stop: int, times_s: FloatArray, length_s: float) -> bool:
-    """Return True if the equal pictures `start` to `stop` are all pictures and span most of the recording."""
-    step = max(_MIN_STEP_S, _MIN_STEP_RATIO * length_s)
-    span_s = times_s[stop] - times_s[start]
-    return stop - start + 1 == len(times_s) and bool(span_s >= max(step, _MIN_SPAN_RATIO * length_s))
 
 
 def _is_same_view(first: FloatArray, second: FloatArray) -> bool:

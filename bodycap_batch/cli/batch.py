@@ -7,7 +7,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,9 +24,10 @@ from bodycap_batch.cli.shared_options import (
     StoreOption,
     checked_requirement,
     make_overrides,
+    split_pair,
 )
 from bodycap_batch.cli.signals import event_on_signal
-from bodycap_batch.cli.terminal import print_line, print_message, print_messages
+from bodycap_batch.cli.terminal import print_line, print_lines, print_message, print_messages, table_lines
 from bodycap_batch.core.context import cores
 from bodycap_batch.core.errors import Cancelled, JobError, worst_exit_code
 from bodycap_batch.core.printable import printable
@@ -144,16 +145,7 @@ def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator
         return
     from bodycap_batch.runner.dask_cluster import QUEUES, SCHEMES, Cluster, start_queue
 
-    if kind in QUEUES:
-        with (
-            start_queue(kind, workers, threads, memory_mb) as queue,
-            Cluster(queue.scheduler_address) as cluster,
-        ):
-            yield _with_worker_note(cluster), _MAX_CLUSTER_JOBS
-    elif kind.startswith(SCHEMES):
-        with Cluster(kind) as cluster:
-            yield _with_worker_note(cluster), _MAX_CLUSTER_JOBS
-    else:
+    if kind not in QUEUES and not kind.startswith(SCHEMES):
         raise JobError(
             f"there is no executor {kind!r}",
             field="--executor",
@@ -161,6 +153,11 @@ def _executor(kind: str, threads: int, workers: int, memory_mb: int) -> Iterator
             f"({' or '.join(f'{scheme}HOST:8786' for scheme in SCHEMES)}), or the name of a queue "
             f"({' or '.join(QUEUES)})",
         )
+    with ExitStack() as stack:
+        address = kind
+        if kind in QUEUES:
+            address = stack.enter_context(start_queue(kind, workers, threads, memory_mb)).scheduler_address
+        yield _with_worker_note(stack.enter_context(Cluster(address))), _MAX_CLUSTER_JOBS
 
 
 def _with_worker_note(cluster: Cluster) -> Cluster:
@@ -201,20 +198,18 @@ def _holds_only_results(path: Path) -> bool:
 def _batch_jobs(jobs: Sequence[Path], priorities: Sequence[str]) -> list[BatchJob]:
     from bodycap_batch.pipeline import BatchJob
 
+    form = "JOB=NUMBER with a job of this batch"
+    hint = "write the job as on the command line, for example --priority monday.yaml=5"
     priority_of_job: dict[Path, int] = {}
     for text in priorities:
-        name, _, number = text.rpartition("=")
+        name, number = split_pair(text, form=form, field="--priority", hint=hint)
         if Path(name) not in jobs or not _INTEGER.fullmatch(number):
-            raise JobError(
-                f"{text!r} does not have the form JOB=NUMBER with a job of this batch",
-                field="--priority",
-                hint="write the job as on the command line, for example --priority monday.yaml=5",
-            )
+            raise JobError(f"{text!r} does not have the form {form}", field="--priority", hint=hint)
         priority_of_job[Path(name)] = int(number)
-    places = [find_job(path) for path in jobs]
+    places = {path: find_job(path) for path in jobs}
     return [
         BatchJob(path=place.file, priority=priority_of_job.get(path, 0), out=place.results)
-        for path, place in zip(jobs, places, strict=True)
+        for path, place in places.items()
     ]
 
 
@@ -229,22 +224,16 @@ class _BatchReporter:
         """Return a function that prints the events of one job."""
 
         def listen(event: Event) -> None:
-            if self._as_json:
-                self._write_json({"job": str(job), **event.to_dict()})
-            elif event.kind != "progress":
-                self._write(printable(f"{_shown_name(job)}: {text_from_event(event)}"))
+            text = "" if event.kind == "progress" else f"{_shown_name(job)}: {text_from_event(event)}"
+            self._write({"job": str(job), **event.to_dict()}, printable(text))
 
         return listen
 
     def report_outcome(self, outcome: Outcome) -> Outcome:
         """Print the outcome of a job, and return this outcome."""
-        if self._as_json:
-            self._write_json({"kind": "job", **outcome.to_dict()})
-        elif outcome.error is not None:
-            name = printable(_shown_name(outcome.job.path))
-            self._write(f"{name}: {outcome.error}")
-            for note in getattr(outcome.error, "__notes__", []):
-                self._write(note)
+        error = outcome.error
+        texts = [] if error is None else [f"{_shown_name(outcome.job.path)}: {error}"]
+        self._write({"kind": "job", **outcome.to_dict()}, *texts, *getattr(error, "__notes__", []))
         return outcome
 
     def print_summary(self, jobs: Sequence[BatchJob], outcomes: Sequence[Outcome]) -> None:
@@ -252,26 +241,25 @@ class _BatchReporter:
         if self._as_json:
             return
         found = {outcome.job: outcome for outcome in outcomes}
-        width = max(len(printable(_shown_name(job.path))) for job in jobs)
-        for job in jobs:
-            print_line(f"{printable(_shown_name(job.path)):{width}}  {_outcome_text(found[job])}")
+        print_lines(table_lines([(_shown_name(job.path), _outcome_text(found[job])) for job in jobs]))
         failed = sum(outcome.exit_code != 0 for outcome in outcomes)
         print_line(f"{len(jobs) - failed} of {len(jobs)} jobs done")
 
-    def _write(self, text: str) -> None:
+    def _write(self, values: dict[str, Any], *texts: str) -> None:
+        """Print the values as one JSON line, or the texts that are not empty with the time of day."""
         with self._lock:
-            print_messages(f"{time.strftime('%H:%M:%S')} {text}")
-
-    def _write_json(self, values: dict[str, Any]) -> None:
-        with self._lock:
-            print_event(values)
+            if self._as_json:
+                print_event(values)
+                return
+            for text in filter(None, texts):
+                print_messages(f"{time.strftime('%H:%M:%S')} {text}")
 
 
 def _shown_name(job: Path) -> str:
-    """Return the name of a job for lists of jobs. For a ``job.yaml``, it includes the folder's name."""
+    """Return the name of a job, safe to print. For a ``job.yaml``, it includes the folder's name."""
     from bodycap_batch.config.folder import JOB_FILES
 
-    return f"{job.resolve().parent.name}/{job.name}" if job.name in JOB_FILES else job.name
+    return printable(f"{job.resolve().parent.name}/{job.name}" if job.name in JOB_FILES else job.name)
 
 
 def _outcome_text(outcome: Outcome) -> str:

@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import asdict
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from bodycap_batch.cli.application import app
 from bodycap_batch.cli.progress_display import command_context
-from bodycap_batch.cli.shared_options import JsonOption
+from bodycap_batch.cli.shared_options import JsonOption, JsonProgressOption, parse_size
 from bodycap_batch.cli.terminal import print_json, print_line, print_lines
 from bodycap_batch.core.errors import JobError
 
 if TYPE_CHECKING:
     from bodycap_batch.calibration import CalibrationBoard
-
-
-class CameraModelOption(StrEnum):
-    """Values of the command-line option that selects the camera model to fit."""
-
-    AUTO = "auto"
-    PINHOLE = "pinhole"
-    OPENCV = "opencv"
-    FISHEYE = "fisheye"
 
 
 @app.command()
@@ -61,9 +50,9 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
         bool, typer.Option("--legacy", help="ChArUco: the board was made with OpenCV before version 4.6.")
     ] = False,
     lens: Annotated[
-        CameraModelOption,
+        Literal["auto", "pinhole", "opencv", "fisheye"],
         typer.Option(help="Camera model; auto selects opencv, or fisheye if fisheye fits better."),
-    ] = (CameraModelOption.AUTO),
+    ] = "auto",
     camera: Annotated[
         str | None,
         typer.Option(
@@ -80,9 +69,7 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
             help="File for the result (default: calib.json in the folder of the video).",
         ),
     ] = None,
-    json_progress: Annotated[
-        bool, typer.Option("--json-progress", help="Print progress as JSON lines.")
-    ] = False,
+    json_progress: JsonProgressOption = False,
 ) -> None:
     """Calibrate a camera from a video of a board.
 
@@ -122,7 +109,7 @@ def calibrate(  # noqa: PLR0913, PLR0917 - the flags a user types
     stated = _stated_board(chessboard, charuco, dictionary, marker, legacy=legacy)
     target = out or video.parent / "calib.json"
     with command_context("calibrate", as_json=json_progress) as context:
-        result = calibrate_clip(video, stated or find_board(video, context), lens.value, context)
+        result = calibrate_clip(video, stated or find_board(video, context), lens, context)
     preview = target.with_name(f"{target.stem}{f'_{camera}' if camera else ''}.png")
     write_calibration(result, target, camera)
     write_preview(result, preview)
@@ -143,25 +130,17 @@ def _stated_board(
             hint="give one of the two options, for example --charuco 7x5, or none",
         )
     if chessboard is not None:
-        columns, rows = _parse_size(chessboard, "--chessboard")
+        columns, rows = parse_size(chessboard, "--chessboard", "the size of a board", _SIZE_HINT)
         return CalibrationBoard(kind="chessboard", columns=columns, rows=rows)
     if charuco is None:
         return None
-    columns, rows = _parse_size(charuco, "--charuco")
+    columns, rows = parse_size(charuco, "--charuco", "the size of a board", _SIZE_HINT)
     return CalibrationBoard(
         kind="charuco", columns=columns, rows=rows, dictionary=dictionary, marker=marker, legacy=legacy
     )
 
 
-def _parse_size(text: str, flag: str) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d{1,3})[xX×](\d{1,3})", text.strip())
-    if found is None:
-        raise JobError(
-            f"{text!r} is not the size of a board", field=flag, hint="give columns x rows, for example 7x5"
-        )
-    return int(found[1]), int(found[2])
-
-
+_SIZE_HINT = "give columns x rows, for example 7x5"
 _MAX_LISTED = 200
 """Maximum number of profiles that the text lists."""
 
@@ -184,7 +163,6 @@ def lenses(
       bodycap lenses hero11 wide 4k
     """  # noqa: D301 - \b keeps lines as they are
     from bodycap_batch.config.lens_profiles import search_lenses
-    from bodycap_batch.core.errors import JobError
 
     words = " ".join(search)
     found = search_lenses(words)

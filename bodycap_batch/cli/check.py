@@ -16,6 +16,7 @@ from bodycap_batch.cli.shared_options import (
     CamerasOption,
     HeightOption,
     JobArgument,
+    JsonFindingsOption,
     OutOption,
     PlacesOption,
     SkeletonOption,
@@ -35,7 +36,7 @@ def check(  # noqa: PLR0913, PLR0917 - the flags a user types
     camera: CamerasOption = None,
     places: PlacesOption = None,
     activity: ActivityOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    as_json: JsonFindingsOption = False,
 ) -> None:
     """Show the files and settings that a job uses, and its problems.
 
@@ -104,7 +105,7 @@ def doctor(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for the results (default: out).")
     ] = Path("out"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    as_json: JsonFindingsOption = False,
 ) -> None:
     """Check this machine: libraries, memory, disk, extras, Blender, a browser.
 

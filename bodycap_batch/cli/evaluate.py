@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -18,14 +16,8 @@ from bodycap_batch.core.percent import format_percent
 TUM_SUFFIXES = (".tum", ".txt")
 _MOTION_FILE = "motion.bvh"
 _TRUTH_FILES = ("joints.npz", "motion.bvh")
-
-
-class Align(StrEnum):
-    """Values of the option that selects how the estimate is aligned with the truth."""
-
-    SIM3 = "sim3"
-    SE3 = "se3"
-    NONE = "none"
+_PICTURE_COUNTS = ("frames", "delivered", "right", "wrong", "not_measurable")
+"""Keys of the numbers of frames that are compared with the pictures, in the order of the table."""
 
 
 @app.command(short_help="Compare results with the truth or with the pictures.")
@@ -44,12 +36,12 @@ def evaluate(
         ),
     ] = None,
     align: Annotated[
-        Align,
+        Literal["sim3", "se3", "none"],
         typer.Option(
             help="How the estimate is aligned with the truth: sim3 (rotation, translation and scale), se3 "
             "(rotation and translation) or none. All cameras get the same alignment."
         ),
-    ] = Align.SIM3,
+    ] = "sim3",
     reference: Annotated[
         str | None,
         typer.Option(
@@ -94,7 +86,7 @@ def evaluate(
     pairs, motions = _trajectory_pairs(estimate, truth), _motion_pair(estimate, truth)
     reports: dict[str, Any] = {}
     if pairs:
-        reports |= _evaluate_trajectories(pairs, estimate, align.value, reference)
+        reports |= _evaluate_trajectories(pairs, estimate, align, reference)
     if motions is not None:
         reports |= _evaluate_motion(*motions)
     if not reports:
@@ -133,12 +125,11 @@ def _evaluate_with_pictures(results: Path, video: Path, *, as_json: bool) -> Non
     if as_json:
         print_json(found, indent=1)
         return
-    print_line(f"{'camera':14}{'frames':>8}{'posed':>8}{'right':>8}{'wrong':>8}{'not measurable':>16}")
-    for name, each in found.items():
-        print_line(
-            f"{name:14}{each['frames']:>8}{each['delivered']:>8}{each['right']:>8}{each['wrong']:>8}"
-            f"{each['not_measurable']:>16}"
-        )
+    for name, *counts, unmeasured in (
+        ("camera", "frames", "posed", "right", "wrong", "not measurable"),
+        *((name, *(each[key] for key in _PICTURE_COUNTS)) for name, each in found.items()),
+    ):
+        print_line(f"{name:14}{''.join(f'{count:>8}' for count in counts)}{unmeasured:>16}")
 
 
 def _evaluate_trajectories(
@@ -163,7 +154,10 @@ def _evaluate_motion(estimate: Path, truth: Path) -> dict[str, Any]:
     """Evaluate all joints. Also evaluate only the joints that the run's metrics.json lists as measured."""
     from bodycap_batch.evaluate import MotionOptions, evaluate_motion
 
-    figures = _motion_figures(estimate.parent)
+    try:
+        figures = json.loads((estimate.parent / "metrics.json").read_bytes())["motion"]
+    except (OSError, ValueError, KeyError, TypeError):
+        figures = {}
     # The times in the estimated BVH file start at zero; the times of true joints (.npz) are on the common
     # clock.
     offset_s = float(figures.get("start_s", 0.0)) if truth.suffix == ".npz" else 0.0
@@ -174,14 +168,6 @@ def _evaluate_motion(estimate: Path, truth: Path) -> dict[str, Any]:
         options = MotionOptions(offset_s=offset_s, roles=roles)
         reports["motion, measured joints"] = evaluate_motion(estimate, truth, options)
     return reports
-
-
-def _motion_figures(results: Path) -> dict[str, Any]:
-    """Return the block `motion` of metrics.json in a results folder; empty without such a block."""
-    try:
-        return dict(json.loads((results / "metrics.json").read_bytes())["motion"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
 
 
 def _frame_counts(results: Path) -> dict[str, int]:
@@ -250,34 +236,28 @@ def _statistics_text(summary: dict[str, float], factor: float) -> str:
 
 def _trajectory_pairs(estimate: Path, truth: Path) -> dict[str, tuple[Path, Path]]:
     """Return the estimated and the true trajectory file of each camera for which both files exist."""
-    if estimate.is_file() and truth.is_file():
-        both = estimate.suffix in TUM_SUFFIXES and truth.suffix in TUM_SUFFIXES
-        return {estimate.stem: (estimate, truth)} if both else {}
-    if not estimate.is_dir():
-        return {}
-    estimates = _by_stem([*estimate.glob("*.tum"), *(estimate / "trajectories").glob("*.tum")])
-    if truth.is_file():
-        single = truth.suffix in TUM_SUFFIXES and len(estimates) == 1
-        return {name: (path, truth) for name, path in estimates.items()} if single else {}
-    truths = _by_stem([*truth.glob("*.tum"), *(truth / "gt").glob("*.tum")])
-    return {name: (estimates[name], truths[name]) for name in sorted(estimates.keys() & truths.keys())}
+    estimates = _paths_in(estimate, "trajectories")
+    if not truth.is_file():
+        truths = _paths_in(truth, "gt")
+        names = sorted(estimates.keys() & truths.keys()) if estimate.is_dir() else ()
+        return {name: (estimates[name], truths[name]) for name in names}
+    is_pair = truth.suffix in TUM_SUFFIXES and len(estimates) == 1
+    return {name: (path, truth) for name, path in estimates.items()} if is_pair else {}
 
 
 def _motion_pair(estimate: Path, truth: Path) -> tuple[Path, Path] | None:
     """Return the file of the estimated motion and the file of the true motion; None if either is missing."""
-    estimates = estimate / _MOTION_FILE if estimate.is_dir() else estimate
-    truths = truth
+    if estimate.is_dir():
+        estimate /= _MOTION_FILE
     if truth.is_dir():
         found = [truth / part / name for part in ("", "gt") for name in _TRUTH_FILES]
-        truths = next((path for path in found if path.is_file()), truth)
-    usable = (
-        estimates.suffix == ".bvh"
-        and estimates.is_file()
-        and truths.suffix in (".bvh", ".npz")
-        and truths.is_file()
-    )
-    return (estimates, truths) if usable else None
+        truth = next((path for path in found if path.is_file()), truth)
+    usable = estimate.suffix == ".bvh" and truth.suffix in (".bvh", ".npz")
+    return (estimate, truth) if usable and estimate.is_file() and truth.is_file() else None
 
 
-def _by_stem(paths: Iterable[Path]) -> dict[str, Path]:
-    return {path.stem: path for path in paths}
+def _paths_in(place: Path, subfolder: str) -> dict[str, Path]:
+    """Return the trajectory files in a folder or its subfolder, or the file itself, by camera name."""
+    if place.is_file():
+        return {place.stem: place} if place.suffix in TUM_SUFFIXES else {}
+    return {path.stem: path for path in (*place.glob("*.tum"), *(place / subfolder).glob("*.tum"))}

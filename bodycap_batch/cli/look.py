@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 import webbrowser
 from pathlib import Path
@@ -102,8 +103,6 @@ class _StoredMarks:
     def __init__(self, job: Job, out_dir: Path, store: Path) -> None:
         self._of = (job, out_dir, store)
         self._lock = threading.Lock()
-        self._marks: FrameOverlays | None = None
-        self._looked = False
 
     def __call__(self, camera: str, first: int) -> list[dict[str, Any]]:
         """Return the points and skeleton to draw over `FRAMES_PER_PART` frames, starting with frame `first`.
@@ -113,22 +112,20 @@ class _StoredMarks:
         from bodycap_batch.report.serving import FRAMES_PER_PART
 
         with self._lock:
-            if not self._looked:
-                self._looked = True
-                self._marks = self._stored()
-            return [] if self._marks is None else self._marks.describe_part(camera, first, FRAMES_PER_PART)
+            overlays = self._overlays
+        return [] if overlays is None else overlays.describe_part(camera, first, FRAMES_PER_PART)
 
-    def _stored(self) -> FrameOverlays | None:
+    @functools.cached_property
+    def _overlays(self) -> FrameOverlays | None:
         from bodycap_batch.report.frame_overlays import FrameOverlays
 
         try:
             inputs = _stored_inputs(*self._of)
-        except BodycapError as error:
-            reason = error.message
-        else:
             if inputs.registrations:
                 return FrameOverlays(inputs)
             reason = "the store no longer contains the camera paths of this job (run the job again)"
+        except BodycapError as error:
+            reason = error.message
         print_message(
             "the points and the skeleton are not drawn over the videos, only over the pictures in the "
             f"report: {reason}"

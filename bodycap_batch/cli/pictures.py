@@ -16,7 +16,6 @@ from bodycap_batch.telemetry.streams import ACCELEROMETER, EXPOSURE, GRAVITY, GY
 if TYPE_CHECKING:
     from bodycap_batch.clocks import ClockEstimates
     from bodycap_batch.clocks.pair_offsets import PairOffset
-    from bodycap_batch.core.arrays import FloatArray
     from bodycap_batch.telemetry import CameraTelemetry, Stream
 
 
@@ -26,38 +25,36 @@ _FRAME = "#c9ced2"
 """Colour of the frame of a panel."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class _Panel:
     """A rectangle with a horizontal and a vertical axis.
 
     Attributes:
-        left: Left edge, SVG units.
+        place: Left edge, width and height, SVG units.
         top: Top edge, SVG units.
-        width: Width, SVG units.
-        height: Height, SVG units.
         x_range: Values at the left and at the right edge.
         y_range: Values at the bottom and at the top edge.
     """
 
-    left: float
+    place: tuple[float, float, float]
     top: float
-    width: float
-    height: float
-    x_range: tuple[float, float]
-    y_range: tuple[float, float]
+    x_range: tuple[float, float] = (0.0, 1.0)
+    y_range: tuple[float, float] = (0.0, 1.0)
 
     def across(self, x: FloatArray | float) -> FloatArray:
         """Return the horizontal positions of values, SVG units."""
-        return np.asarray(self.left + self.width * (x - self.x_range[0]) / np.ptp(self.x_range))
+        left, width, _ = self.place
+        return np.asarray(left + width * (x - self.x_range[0]) / np.ptp(self.x_range))
 
     def down(self, y: FloatArray | float) -> FloatArray:
         """Return the vertical positions of values, SVG units. Values beyond the axis are at its ends."""
         share = np.clip((y - self.y_range[0]) / np.ptp(self.y_range), 0.0, 1.0)
-        return np.asarray(self.top + self.height * (1.0 - share))
+        return np.asarray(self.top + self.place[2] * (1.0 - share))
 
     def frame(self) -> str:
         """Return the frame of the panel."""
-        size = {"x": self.left, "y": self.top, "width": self.width, "height": self.height}
+        left, width, height = self.place
+        size = {"x": left, "y": self.top, "width": width, "height": height}
         return element("rect", **size, fill="none", stroke=_FRAME, stroke_width=1)
 
     def line(self, x: FloatArray, y: FloatArray, colour: str, **attributes: object) -> str:
@@ -67,10 +64,10 @@ class _Panel:
 
     def labels(self, start: str, middle: str, end: str) -> str:
         """Return the labels below the left edge, the middle and the right edge."""
-        below = self.top + self.height + 14.0
+        left, width, height = self.place
         places = ((0.0, start, "start"), (0.5, middle, "middle"), (1.0, end, "end"))
         return "".join(
-            text(self.left + share * self.width, below, words, font_size=11, text_anchor=anchor)
+            text(left + share * width, self.top + height + 14.0, words, font_size=11, text_anchor=anchor)
             for share, words, anchor in places
             if words
         )
@@ -92,10 +89,8 @@ def _drawing(headings: Sequence[tuple[float, str]], rows: Sequence[str], nothing
     return svg_image(_WIDTH, height, "".join(parts), title, font_family="sans-serif")
 
 
-_PANEL_HEIGHT = 84.0
-"""Height of a panel, SVG units."""
-_CURVE, _CHUNKS = (16.0, 400.0), (476.0, 468.0)
-"""Left edge and width of the panels with the correlation and with the offsets of the windows, SVG units."""
+_CURVE, _CHUNKS = (16.0, 400.0, 84.0), (476.0, 468.0, 84.0)
+"""Places of the panels with the correlation and with the offsets of the windows, as in `_Panel`."""
 _LEAST_RANGE_S = 0.004
 """Least range of the offsets in a panel, seconds. Origin: twice the usual way of sound."""
 _AGREES, _DISAGREES, _LINE = "#0b6e4f", "#b3261e", "#5b6770"
@@ -128,21 +123,14 @@ def _pair_row(pair: PairOffset, top: float) -> str:
     return name + _curve_panel(pair, top + 24.0) + _chunk_panel(pair, top + 24.0)
 
 
-def _panel(
-    place: tuple[float, float], top: float, x_range: tuple[float, float], y_range: tuple[float, float]
-) -> _Panel:
-    left, width = place
-    return _Panel(left=left, top=top, width=width, height=_PANEL_HEIGHT, x_range=x_range, y_range=y_range)
-
-
 def _curve_panel(pair: PairOffset, top: float) -> str:
     if pair.curve is None or pair.curve_lags_s is None or not len(pair.curve):
-        return _panel(_CURVE, top, (0.0, 1.0), (0.0, 1.0)).frame()
+        return _Panel(_CURVE, top).frame()
     # Of neighbouring values, the largest is drawn, so that no peak is lost.
     step = max(1, len(pair.curve) // 480)
     count = len(pair.curve) // step
     values = pair.curve[: count * step].reshape(count, step).max(axis=1)
-    panel = _panel(_CURVE, top, (-0.5, count - 0.5), (0.0, max(float(values.max()), 1e-12) / 0.95))
+    panel = _Panel(_CURVE, top, (-0.5, count - 0.5), (0.0, max(float(values.max()), 1e-12) / 0.95))
     reach_ms = 500.0 * float(np.ptp(pair.curve_lags_s))
     line = panel.line(np.arange(float(count)), values, _LINE)
     return panel.frame() + line + panel.labels(f"{-reach_ms:.0f}", "0", f"+{reach_ms:.0f}")
@@ -150,7 +138,7 @@ def _curve_panel(pair: PairOffset, top: float) -> str:
 
 def _chunk_panel(pair: PairOffset, top: float) -> str:
     if not pair.chunks:
-        return _panel(_CHUNKS, top, (0.0, 1.0), (0.0, 1.0)).frame()
+        return _Panel(_CHUNKS, top).frame()
     times = np.array([chunk.time_s for chunk in pair.chunks])
     offsets = np.array([chunk.offset_s for chunk in pair.chunks])
     shown = offsets[[chunk.agrees for chunk in pair.chunks]] if pair.accepted else offsets
@@ -158,7 +146,7 @@ def _chunk_panel(pair: PairOffset, top: float) -> str:
     reach = 0.6 * max(float(np.ptp(shown)), _LEAST_RANGE_S)
     begin, span = float(times.min()), max(float(np.ptp(times)), 1e-6)
     beside = 0.02 * span
-    panel = _panel(_CHUNKS, top, (begin - beside, begin + span + beside), (middle - reach, middle + reach))
+    panel = _Panel(_CHUNKS, top, (begin - beside, begin + span + beside), (middle - reach, middle + reach))
     out = panel.frame()
     for chunk, x, y in zip(pair.chunks, panel.across(times), panel.down(offsets), strict=True):
         out += element("circle", cx=x, cy=y, r=3, fill=_AGREES if chunk.agrees else _DISAGREES)
@@ -172,9 +160,9 @@ def _chunk_panel(pair: PairOffset, top: float) -> str:
     )
 
 
-_PANEL = {"left": 70.0, "width": 870.0, "height": 100.0}
-"""Left edge, width and height of a panel, SVG units."""
-_BINS = 870
+_STREAM = (70.0, 870.0, 100.0)
+"""Place of the panel of a stream, as in `_Panel`."""
+_BINS = round(_STREAM[1])
 """Number of parts of the time axis: one for each SVG unit."""
 _DRAWN = {
     GYROSCOPE: "Angular rate (rad/s): x right, y down, z forward",
@@ -203,7 +191,7 @@ def draw_telemetry(found: CameraTelemetry) -> str:
     end = max((float(stream.times_s[-1]) for stream in streams), default=0.0)
     span_s = begin, max(end, begin + 1e-6)
     rows = [_row(stream, _TOP + row * _ROW, span_s) for row, stream in enumerate(streams)]
-    return _drawing(((_PANEL["left"], title),), rows, "The video has no telemetry.", title)
+    return _drawing(((_STREAM[0], title),), rows, "The video has no telemetry.", title)
 
 
 def _row(stream: Stream, top: float, span_s: tuple[float, float]) -> str:
@@ -212,18 +200,17 @@ def _row(stream: Stream, top: float, span_s: tuple[float, float]) -> str:
     # The lines keep a distance of a twenty-fifth from the frame. A constant stream is drawn as well.
     reach = max(high - low, 1e-3 * max(abs(low), abs(high)), 1e-9) / 0.92
     y_range = low - 0.04 * reach, low + 0.96 * reach
-    panel = _Panel(top=top + 16.0, x_range=span_s, y_range=y_range, **_PANEL)
+    (left, _, height), panel = _STREAM, _Panel(_STREAM, top + 16.0, span_s, y_range)
     title = f"{_DRAWN[stream.key]}, {stream.rate_hz:.2f} per second"
-    out = text(panel.left, top + 10.0, title, font_size=12)
+    out = text(left, top + 10.0, title, font_size=12)
     for gap_s in stream.gaps_s:
         start, stop = panel.across(np.array(gap_s)).tolist()
-        width = max(1.0, stop - start)
-        out += element("rect", x=start, y=panel.top, width=width, height=panel.height, fill=_GAP)
+        out += element("rect", x=start, y=panel.top, width=max(1.0, stop - start), height=height, fill=_GAP)
     out += panel.frame()
     for column, colour in zip(range(min(3, stream.values.shape[1])), _COLOURS, strict=False):
         out += panel.line(*_extremes(stream.times_s, stream.values[:, column]), colour, stroke_width=0.8)
-    for y, value in ((panel.top + 10.0, high), (panel.top + panel.height, low)):
-        out += text(panel.left - 4.0, y, f"{value:.3g}", font_size=11, text_anchor="end")
+    for y, value in ((panel.top + 10.0, high), (panel.top + height, low)):
+        out += text(left - 4.0, y, f"{value:.3g}", font_size=11, text_anchor="end")
     return out + panel.labels(f"{number(span_s[0])} s", "", f"{number(span_s[1])} s")
 
 

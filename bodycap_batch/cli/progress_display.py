@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from bodycap_batch.cli.job_progress import READING_VIDEOS, JobProgress
 from bodycap_batch.cli.signals import event_on_signal
@@ -44,20 +44,26 @@ def print_event(values: Mapping[str, Any]) -> None:
     print_json({"schema": _SCHEMA, "time": time_text, **values})
 
 
-class ProgressDisplay(Protocol):
-    """A display that shows the events of a job; a context manager."""
+class ProgressDisplay:
+    """A display that shows the events of a job, which come from several threads; a context manager."""
 
-    def __enter__(self) -> Self: ...
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> Self:
+        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+    ) -> None:
+        """Close the display."""
 
     def expect_cameras(self, count: int) -> None:
         """Tell the display how many cameras the job has."""
 
     def __call__(self, event: Event) -> None:
         """Show one event."""
+        raise NotImplementedError
 
 
 def make_progress_display(*, as_json: bool) -> ProgressDisplay:
@@ -84,25 +90,7 @@ def command_context(stage: str, *, as_json: bool, threads: int = 1) -> Iterator[
         progress.complete()
 
 
-class _Display:
-    """What all displays have: events come from several threads, and some displays have nothing to close."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Do nothing: there is nothing to close."""
-
-    def expect_cameras(self, count: int) -> None:
-        """Do nothing: the number of cameras changes nothing in the lines."""
-
-
-class JsonLines(_Display):
+class JsonLines(ProgressDisplay):
     """Prints each event as one line with a JSON object on standard output."""
 
     def __call__(self, event: Event) -> None:
@@ -111,7 +99,7 @@ class JsonLines(_Display):
             print_event(event.to_dict())
 
 
-class ProgressLines(_Display):
+class ProgressLines(ProgressDisplay):
     """Prints plain lines on standard error: every few seconds, or after every tenth of a stage."""
 
     def __init__(self) -> None:
@@ -148,12 +136,8 @@ class _LinePacer:
         self._written, self._share = now, progress
         seconds, done = now - self._first[0], event.done - self._first[1]
         rate = done / seconds if seconds > 0 and done > 0 else None
-        text = f"{event.label}: {event.done}"
-        text += (
-            f" of {event.total} {event.what} ({format_percent(progress)})"
-            if event.total
-            else f" {event.what}"
-        )
+        of_all = f" of {event.total} {event.what} ({format_percent(progress)})"
+        text = f"{event.label}: {event.done}{of_all if event.total else f' {event.what}'}"
         if rate is not None:
             text += f", {rate:.3g}/s"
             if event.done < event.total:
@@ -161,7 +145,7 @@ class _LinePacer:
         return text
 
 
-class LiveProgress(_Display):
+class LiveProgress(ProgressDisplay):
     """Shows on a terminal one line for the job, with the time left, and the current tasks beneath it."""
 
     def __init__(self) -> None:

@@ -16,6 +16,7 @@ from bodycap_batch.cli.shared_options import (
     CamerasOption,
     HeightOption,
     JobArgument,
+    JsonProgressOption,
     MemoryOption,
     OutOption,
     PlacesOption,
@@ -58,9 +59,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
         typer.Option(help="Stop after this stage. Only the last stage writes the results folder."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Repeat every stage.")] = False,
-    json_progress: Annotated[
-        bool, typer.Option("--json-progress", help="Print progress as JSON lines on standard output.")
-    ] = False,
+    json_progress: JsonProgressOption = False,
     verbose: Annotated[
         bool,
         typer.Option(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -108,6 +109,10 @@ MemoryOption = Annotated[
 StoreOption = Annotated[Path | None, _store("the one that the results name, else .store beside them")]
 WatchStoreOption = Annotated[Path | None, _store(".store beside INBOX")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+JsonFindingsOption = Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")]
+JsonProgressOption = Annotated[
+    bool, typer.Option("--json-progress", help="Print progress as JSON lines on standard output.")
+]
 
 
 def make_overrides(
@@ -162,6 +167,14 @@ def split_pair(text: str, *, form: str, field: str, hint: str) -> tuple[str, str
     if not (name and equals and value):
         raise JobError(f"{text[:60]!r} does not have the form {form}", field=field, hint=hint)
     return name.strip(), value.strip()
+
+
+def parse_size(text: str, field: str, what: str, hint: str) -> tuple[int, int]:
+    """Return the two numbers of a size such as 640x480. Raises `JobError` if it has another form."""
+    found = re.fullmatch(r"([0-9]{1,5})[xX×]([0-9]{1,5})", text.strip())
+    if found is None:
+        raise JobError(f"{text!r} is not {what}", field=field, hint=hint)
+    return int(found[1]), int(found[2])
 
 
 def results_folder(job: Job) -> Path:

@@ -11,7 +11,7 @@ import typer
 
 from bodycap_batch.cli.application import app
 from bodycap_batch.cli.shared_options import HeightOption, make_overrides, split_pair
-from bodycap_batch.cli.terminal import print_json, print_lines
+from bodycap_batch.cli.terminal import print_json, print_lines, table_lines
 
 if TYPE_CHECKING:
     from bodycap_batch.formats.bvh import RigOptions
@@ -109,11 +109,7 @@ def _joint_table(rig: SkeletonModel) -> list[str]:
         name = "  " * min(depth[line.name], 12) + line.name
         bone = f"{100.0 * line.bone_m:5.1f} cm" if line.points else ""
         rows.append((name, line.role or "-", bone, line.points, line.note))
-    widths = [max(len(row[column]) for row in rows) for column in range(4)]
-    return [
-        "  ".join((*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[4])).rstrip()
-        for row in rows
-    ]
+    return table_lines(rows)
 
 
 def _closing_lines(rig: SkeletonModel, options: RigOptions) -> list[str]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bodycap_batch.cli.application import app
-from bodycap_batch.cli.terminal import print_json, print_line, print_lines
+from bodycap_batch.cli.terminal import print_json, print_line, print_lines, table_lines
 from bodycap_batch.core.percent import format_percent
 from bodycap_batch.core.printable import printable
 
@@ -123,24 +123,12 @@ def _job_table(rows: list[JobRow]) -> list[str]:
     cells = [("JOB", "STATE", "STAGE", "PROGRESS", "TIME", "VERDICT", "")]
     for row in rows:
         progress = "" if row.progress is None else format_percent(row.progress)
+        time = _time_text(row.duration_s if row.state in _ENDED else row.age_s)
         cause = printable(" ".join((row.cause or row.headline).split()))
         cause = cause if len(cause) <= _MAX_CAUSE_LENGTH else f"{cause[: _MAX_CAUSE_LENGTH - 1]}…"
-        cells.append(
-            (
-                printable(row.name),
-                printable(row.state),
-                printable(row.stage),
-                progress,
-                _time_text(row.duration_s if row.state in _ENDED else row.age_s),
-                printable(row.verdict),
-                cause,
-            )
-        )
-    widths = [max(len(line[column]) for line in cells) for column in range(6)]
-    lines = [
-        "  ".join(f"{part:{width}}" for part, width in zip(line, widths, strict=False)) for line in cells
-    ]
-    return [f"{line}  {cell[6]}".rstrip() for line, cell in zip(lines, cells, strict=True)]
+        name, state, stage, verdict = map(printable, (row.name, row.state, row.stage, row.verdict))
+        cells.append((name, state, stage, progress, time, verdict, cause))
+    return table_lines(cells)
 
 
 def _time_text(seconds: float | None) -> str:

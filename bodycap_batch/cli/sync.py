@@ -73,17 +73,16 @@ def with_clocks_of_run(estimates: ClockEstimates, results: Path) -> ClockEstimat
         stored = json.loads((results / "metrics.json").read_bytes())["clocks"]
     except (OSError, ValueError, KeyError, TypeError):
         stored = {}
-    cameras = []
-    for clock in estimates.cameras:
-        found = stored.get(clock.camera, {}) if clock.source == "none" else {}
+
+    def completed(clock: ClockEstimate) -> ClockEstimate:
+        if clock.source != "none":
+            return clock
+        found, values, reason = stored.get(clock.camera, {}), {}, "needs a run, which compares the motion"
         if found.get("source") == "motion":
-            values = {key: found[key] for key in _KEYS}
-            cameras.append(replace(clock, **values, reasons=(*clock.reasons, "from the last run of the job")))
-        elif clock.source == "none":
-            cameras.append(replace(clock, reasons=(*clock.reasons, "needs a run, which compares the motion")))
-        else:
-            cameras.append(clock)
-    return replace(estimates, cameras=tuple(cameras))
+            values, reason = {key: found[key] for key in _KEYS}, "from the last run of the job"
+        return replace(clock, **values, reasons=(*clock.reasons, reason))
+
+    return replace(estimates, cameras=tuple(map(completed, estimates.cameras)))
 
 
 _KEYS = ("offset_s", "sigma_s", "drift_ppm", "drift_sigma_ppm", "source")

@@ -10,7 +10,7 @@ import typer
 
 from bodycap_batch.cli.application import app
 from bodycap_batch.cli.progress_display import command_context
-from bodycap_batch.cli.shared_options import ThreadsOption
+from bodycap_batch.cli.shared_options import JsonProgressOption, ThreadsOption, parse_size
 from bodycap_batch.cli.terminal import print_line
 from bodycap_batch.core.context import cores
 from bodycap_batch.core.errors import JobError
@@ -56,9 +56,7 @@ def synth(  # noqa: PLR0913, PLR0917 - the flags a user types
         ),
     ] = None,
     threads: ThreadsOption = None,
-    json_progress: Annotated[
-        bool, typer.Option("--json-progress", help="Print progress as JSON lines on standard output.")
-    ] = False,
+    json_progress: JsonProgressOption = False,
 ) -> None:
     """Render a sample capture, for which the true motion is known.
 
@@ -84,24 +82,14 @@ def synth(  # noqa: PLR0913, PLR0917 - the flags a user types
     values: dict[str, Any] = {"seconds": seconds, "fps": fps, "seed": seed, "motion": motion}
     values["cameras"] = cameras.split(",") if cameras else None
     values["poses_only"] = poses or None
-    options = _synth_options({**values, **_parse_size(size), **_parse_settings(more or [])})
+    if size is not None:
+        hint = "give width x height in pixels, for example 640x480"
+        values["width"], values["height"] = parse_size(size, "--size", "an image size", hint)
+    options = _synth_options({**values, **_parse_settings(more or [])})
     with command_context("synth", as_json=json_progress, threads=threads or cores()) as context:
         synthesise(options, out, context)
     if not json_progress:
         print_line(f"capture: {out.resolve()}")
-
-
-def _parse_size(text: str | None) -> dict[str, int]:
-    if text is None:
-        return {}
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal()):
-        raise JobError(
-            f"{text!r} is not an image size",
-            field="--size",
-            hint="give width x height in pixels, for example 640x480",
-        )
-    return {"width": int(width), "height": int(height)}
 
 
 def _parse_settings(settings: list[str]) -> dict[str, Any]:

@@ -23,6 +23,10 @@ _MAX_LISTED_GAPS = 5
 """Maximum number of gaps that the text lists for each stream."""
 _WIDTH = 110
 """Maximum number of characters of a line of text that is wrapped."""
+_FACTS = (
+    "source", "model", "firmware", "lens_mode", "stabilisation", "is_timelapse", "axes_known",
+)  # fmt: skip
+"""Attributes of the telemetry that the JSON output holds as they are."""
 
 
 @app.command()
@@ -107,13 +111,11 @@ def comparison_lines(compared: PictureGyroComparison) -> Iterator[str]:
 
 
 def _comparison_as_json(compared: PictureGyroComparison) -> dict[str, Any]:
-    out: dict[str, Any] = {"verdict": compared.verdict, "reason": compared.reason}
-    for name in ("fit", "undone"):
-        fit = getattr(compared, name)
-        out[name] = None if fit is None else {
-            key: np.asarray(value).tolist() for key, value in asdict(fit).items()
-        }  # fmt: skip
-    return out
+    fits = {
+        name: fit and {key: np.asarray(value).tolist() for key, value in asdict(fit).items()}
+        for name, fit in (("fit", compared.fit), ("undone", compared.undone))
+    }
+    return {"verdict": compared.verdict, "reason": compared.reason, **fits}
 
 
 def telemetry_as_json(
@@ -121,13 +123,7 @@ def telemetry_as_json(
 ) -> dict[str, Any]:
     """Return the telemetry as plain JSON values, with statistics instead of samples."""
     return {
-        "source": found.source,
-        "model": found.model,
-        "firmware": found.firmware,
-        "lens_mode": found.lens_mode,
-        "stabilisation": found.stabilisation,
-        "is_timelapse": found.is_timelapse,
-        "axes_known": found.axes_known,
+        **{key: getattr(found, key) for key in _FACTS},
         "streams": {key: _statistics(stream) for key, stream in found.streams.items()},
         "gps": None if found.gps is None else _gps_statistics(found.gps),
         "other_streams": dict(found.other_streams),
@@ -178,17 +174,9 @@ def lines_of(found: CameraTelemetry, name: str) -> Iterator[str]:
         found: The telemetry.
         name: Name of the video or folder.
     """
-    camera = ", ".join(
-        part
-        for part in (
-            found.model or "camera model unknown",
-            f"firmware {found.firmware}" if found.firmware else "",
-            f"lens mode {found.lens_mode}" if found.lens_mode else "",
-            f"stabilisation {found.stabilisation}" if found.stabilisation else "",
-        )
-        if part
-    )
-    yield f"{name}: {camera}"
+    facts = {"firmware": found.firmware, "lens mode": found.lens_mode, "stabilisation": found.stabilisation}
+    stated = (f"{fact} {value}" for fact, value in facts.items() if value)
+    yield f"{name}: {', '.join((found.model or 'camera model unknown', *stated))}"
     if found.source == "none":
         yield "no telemetry: neither in the video nor in a file <camera>.imu.csv or <camera>.gcsv beside it"
         return

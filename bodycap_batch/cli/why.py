@@ -24,7 +24,7 @@ from bodycap_batch.cli.shared_options import (
     make_overrides,
     results_folder,
 )
-from bodycap_batch.cli.terminal import print_json, print_line
+from bodycap_batch.cli.terminal import print_json, print_line, print_lines, table_lines
 from bodycap_batch.core.errors import StoreError
 from bodycap_batch.job_places import find_job, find_store, is_store
 
@@ -65,9 +65,11 @@ def why(  # noqa: PLR0913, PLR0917 - the flags a user types
     if as_json:
         print_json([step.to_dict() for step in steps], indent=1)
         return
-    width = max(len(step.stage) for step in steps)
-    for step in steps:
-        print_line(f"{step.stage:{width}}  {'stored' if step.stored else f'would run: {step.reason}'}")
+    print_lines(
+        table_lines(
+            [(each.stage, "stored" if each.stored else f"would run: {each.reason}") for each in steps]
+        )
+    )
     if all(step.stored for step in steps):
         print_line("nothing to do")
 

@@ -25,6 +25,9 @@ BODY_PARTS: dict[str, tuple[str, ...]] = {
 _MIN_SPAN_S = 0.1
 """Seconds of a change of state that is not a span of its own. Evidence: none; nobody sees a shorter span."""
 
+_WHOLE_SHARE = 0.95
+"""Share of ticks from which a part counts as measured, or as not measured. Evidence: none."""
+
 
 class PartState(StrEnum):
     """How much of a part of the body the cameras measured."""
@@ -92,6 +95,21 @@ def part_states(motion: Motion) -> dict[str, IntArray]:
             seen = motion.observed[:, joints]
             out[part] = np.asarray(seen.any(axis=1), dtype=np.int64) + seen.all(axis=1).astype(np.int64)
     return out
+
+
+def overall_state(measured: float, seen: float, *, is_filled: bool) -> PartState:
+    """Return the state of a part of the body, or of a joint, over the whole motion.
+
+    Args:
+        measured: Share of ticks at which all of it was measured.
+        seen: Share of ticks at which some of it was measured.
+        is_filled: True if it was filled with a plausible motion.
+    """
+    if measured >= _WHOLE_SHARE:
+        return PartState.MEASURED
+    if seen > 1.0 - _WHOLE_SHARE:
+        return PartState.PARTLY
+    return PartState.FILLED if is_filled else PartState.UNMEASURED
 
 
 def part_spans(motion: Motion) -> list[PartSpan]:

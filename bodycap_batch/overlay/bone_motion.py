@@ -66,32 +66,31 @@ class BoneMotion:
         return Bones(ends_in_world=ends, observed=self.observed[before] & self.observed[after])
 
 
-def bones_from_motion(motion: Motion) -> BoneMotion:
+def bones_from_motion(motion: Motion, shown: BoolArray | None = None) -> BoneMotion:
     """Return the bones of a motion.
 
     Each joint has one bone to each of its children. A joint with an end point also has a bone to this point.
+
+    Args:
+        motion: The motion.
+        shown: (J,) joints between which bones are returned; None for all joints.
     """
     skeleton = motion.skeleton
+    shown = np.ones(len(skeleton.joints), dtype=bool) if shown is None else shown
     world_from_joint = motion.world_from_joint()
     centres = world_from_joint[..., :3, 3]
-    children = [joint for joint in range(1, len(skeleton.joints)) if np.any(skeleton.offsets_m[joint])]
-    parents = [int(skeleton.parents[joint]) for joint in children]
-    end_joints = np.flatnonzero(np.isfinite(skeleton.end_offsets_m).all(axis=1)).tolist()
-    ends = [
-        np.stack([centres[:, parent], centres[:, child]], axis=1)
-        for parent, child in zip(parents, children, strict=True)
-    ]
-    for joint in end_joints:
-        tip = world_from_joint[:, joint, :3, :3] @ skeleton.end_offsets_m[joint] + centres[:, joint]
-        ends.append(np.stack([centres[:, joint], tip], axis=1))
-    joints = np.array([*parents, *end_joints], dtype=np.int64)
+    parents = skeleton.parents
+    children = np.flatnonzero(skeleton.offsets_m.any(axis=1) & (parents >= 0) & shown & shown[parents])
+    tipped = np.flatnonzero(np.isfinite(skeleton.end_offsets_m).all(axis=1) & shown)
+    tips = world_from_joint[:, tipped, :3, :3] @ skeleton.end_offsets_m[tipped][..., None]
+    starts = np.concatenate([parents[children], tipped])
+    far_ends = np.concatenate([centres[:, children], tips[..., 0] + centres[:, tipped]], axis=1)
     return BoneMotion(
-        joints=joints,
+        joints=starts,
         sides=tuple(
-            split_side(skeleton.roles[joint] or skeleton.joints[joint])[0]
-            for joint in [*children, *end_joints]
+            split_side(skeleton.roles[joint] or skeleton.joints[joint])[0] for joint in (*children, *tipped)
         ),
         times_ns=motion.times_ns(),
-        ends_in_world=np.stack(ends, axis=1) if ends else np.zeros((len(centres), 0, 2, 3)),
-        observed=motion.observed[:, joints],
+        ends_in_world=np.stack([centres[:, starts], far_ends], axis=2),
+        observed=motion.observed[:, starts],
     )

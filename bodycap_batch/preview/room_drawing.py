@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.overlay import Bones, Colour, RgbImage
@@ -103,14 +102,10 @@ def draw_lines(
     image: RgbImage, view: Viewpoint, lines: FloatArray, colour: Colour, thickness: int = 1
 ) -> None:
     """Draw straight lines (L,2,3). A line is omitted if one of its ends is behind the viewer."""
-    import cv2
-
     px, depth = view.project(lines)
     min_depth = _MIN_LINE_DEPTH * view.distance
     drawable = (depth > min_depth).all(axis=1) & (np.abs(px) < _MAX_LINE_PX).all(axis=(1, 2))
-    cv2.polylines(
-        image, list(_fixed_point(px[drawable])), False, colour, thickness, cv2.LINE_AA, SUBPIXEL_BITS
-    )
+    _draw_px(image, px[drawable], colour, thickness)
 
 
 def draw_camera(
@@ -145,29 +140,21 @@ def draw_body(image: RgbImage, view: Viewpoint, bones: Bones, sides: Sequence[st
 
 
 def _draw_bone(image: RgbImage, ends: FloatArray, width: int, colour: Colour, *, solid: bool) -> None:
-    import cv2
-
     if solid:
-        line = list(_fixed_point(ends[None]))
-        cv2.polylines(image, line, False, _OUTLINE_COLOUR, width + 4, cv2.LINE_AA, SUBPIXEL_BITS)
-        cv2.polylines(image, line, False, colour, width, cv2.LINE_AA, SUBPIXEL_BITS)
-        joints = list(_fixed_point(ends[:, None].repeat(2, axis=1)))
-        cv2.polylines(image, joints, False, colour, width + 3, cv2.LINE_AA, SUBPIXEL_BITS)
+        _draw_px(image, ends[None], _OUTLINE_COLOUR, width + 4)
+        _draw_px(image, ends[None], colour, width)
+        _draw_px(image, ends[:, None].repeat(2, axis=1), colour, width + 3)  # the joints
         return
     count = max(2, round(float(np.linalg.norm(ends[1] - ends[0])) / _DASH_PX))
     share = np.linspace(0.0, 1.0, 2 * count)[:, None]
     dashes = ((1.0 - share) * ends[0] + share * ends[1]).reshape(count, 2, 2)
     red, green, blue = (round(0.75 * part) for part in colour)
-    cv2.polylines(
-        image,
-        list(_fixed_point(dashes)),
-        False,
-        (red, green, blue),
-        max(2, width // 3),
-        cv2.LINE_AA,
-        SUBPIXEL_BITS,
-    )
+    _draw_px(image, dashes, (red, green, blue), max(2, width // 3))
 
 
-def _fixed_point(px: FloatArray) -> npt.NDArray[np.int32]:
-    return np.asarray(np.round(px * (1 << SUBPIXEL_BITS)), dtype=np.int32)
+def _draw_px(image: RgbImage, lines_px: FloatArray, colour: Colour, thickness: int) -> None:
+    """Draw straight lines (L,2,2) between pixels."""
+    import cv2
+
+    fixed_point = np.round(lines_px * (1 << SUBPIXEL_BITS)).astype(np.int32)
+    cv2.polylines(image, list(fixed_point), False, colour, thickness, cv2.LINE_AA, SUBPIXEL_BITS)

@@ -16,6 +16,7 @@ from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.formats.bvh import inspect_rig
 from bodycap_batch.formats.joint_positions import motion_from_positions, read_joint_positions
 from bodycap_batch.formats.joint_table import read_joint_table
+from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.joint_angles import angle_curves, foot_curves
 from bodycap_batch.model.skeleton import Motion
 from bodycap_batch.report.figures.motion_curves import Take, draw_motion_curves
@@ -28,8 +29,8 @@ _TRUTH_FILES = ("gt/joints.npz", "joints.npz")
 _NAMES = ("A", "B")
 _PATH_SIZE, _PATH_MARGIN = 460.0, 26.0
 """Size and margin of the drawing of the paths, SVG units."""
-_PATH_ROLES = {"Hips": "hips", "LeftHand": "left hand", "RightHand": "right hand"}
-"""Joints whose paths are drawn, with their names in the legend."""
+_PATH_ROLES = ("Hips", "LeftHand", "RightHand")
+"""Roles of the joints whose paths are drawn."""
 _SCALE_BARS_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 """Possible lengths of the scale bar, metres."""
 _STEP_LEAST_S = 0.1
@@ -76,7 +77,14 @@ def load_take(path: Path, name: str, start_s: float = 0.0) -> Take:
             hint="give a BVH file, a folder with a motion.bvh, or a truth as gt/joints.npz",
         )
     if file.suffix.lower() == ".npz":
-        return Take(name=name, motion=_true_motion(file), start_s=start_s)
+        motion = motion_from_positions(read_joint_positions(file))
+        if motion is None:
+            raise JobError(
+                "the file holds no motion of a body: it has no hips or only one time",
+                path=file,
+                hint="give a file whose names contain root, and at least two times",
+            )
+        return Take(name=name, motion=motion, start_s=start_s)
     _, motion, _ = inspect_rig(file)  # the clearance of the feet needs the axes of the body
     if motion is None:
         raise JobError("the BVH file contains no frames", path=file, hint="give a BVH file with a motion")
@@ -84,17 +92,6 @@ def load_take(path: Path, name: str, start_s: float = 0.0) -> Take:
     if path.is_dir() and table.is_file():
         motion = replace(motion, observed=_observed(table, motion))
     return Take(name=name, motion=motion, start_s=start_s)
-
-
-def _true_motion(file: Path) -> Motion:
-    motion = motion_from_positions(read_joint_positions(file))
-    if motion is None:
-        raise JobError(
-            "the file holds no motion of a body: it has no hips or only one time",
-            path=file,
-            hint="give a file whose names contain root, and at least two times",
-        )
-    return motion
 
 
 def _observed(table: Path, motion: Motion) -> BoolArray:
@@ -139,7 +136,8 @@ def compare(first: Path, second: Path, shift_s: float = 0.0) -> Comparison:
         JobError: A motion is missing or cannot be read, or the two have no time in common.
     """
     a, b = load_take(first, "A"), load_take(second, "B", shift_s)
-    low, high = _common_span(a, b)
+    times = a.times_s(), b.times_s()
+    low, high = float(max(each[0] for each in times)), float(min(each[-1] for each in times))
     if high - low <= 0.0:
         raise JobError(
             "the two motions have no time in common",
@@ -151,8 +149,7 @@ def compare(first: Path, second: Path, shift_s: float = 0.0) -> Comparison:
     angles = {}
     for name in (each for each in names[0] if each in names[1]):
         values = [
-            np.interp(grid, take.times_s(), found[name].degrees)
-            for take, found in zip((a, b), names, strict=True)
+            np.interp(grid, each, found[name].degrees) for each, found in zip(times, names, strict=True)
         ]
         shares = [float(found[name].measured.mean()) for found in names]
         angles[name] = {**_difference(values[0], values[1]), "measured_a": shares[0], "measured_b": shares[1]}
@@ -163,11 +160,6 @@ def compare(first: Path, second: Path, shift_s: float = 0.0) -> Comparison:
         "motions": {take.name: _extent(take.motion) for take in (a, b)},
     }
     return Comparison(takes=(a, b), sources=(str(first), str(second)), figures=figures)
-
-
-def _common_span(a: Take, b: Take) -> tuple[float, float]:
-    first, second = a.times_s(), b.times_s()
-    return max(float(first[0]), float(second[0])), min(float(first[-1]), float(second[-1]))
 
 
 def _difference(first: FloatArray, second: FloatArray) -> dict[str, float | None]:
@@ -230,9 +222,7 @@ def _aligned(a: Take, b: Take, low: float, high: float) -> Motion:
     )
     if np.linalg.norm(centred[1]) < 1e-6 or np.linalg.norm(centred[0]) < 1e-6:
         angle = 0.0
-    turn = np.array(
-        [[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]]
-    )
+    turn = so3_exp([0.0, 0.0, angle])
     shift = np.append(paths[0].mean(axis=0) - paths[1].mean(axis=0) @ turn[:2, :2].T, 0.0)
     local = b.motion.local_rotation.copy()
     local[:, 0] = turn @ local[:, 0]

@@ -107,6 +107,11 @@ class Coverage:
         return sum(camera.frames for camera in self.cameras.values())
 
     @property
+    def delivered(self) -> int:
+        """Number of frames of all cameras that are delivered."""
+        return sum(camera.delivered for camera in self.cameras.values())
+
+    @property
     def other_maps(self) -> int:
         """Number of further frames of all cameras with a pose in another map than that of the path."""
         return sum(camera.other_maps for camera in self.cameras.values())
@@ -119,13 +124,7 @@ class Coverage:
     @property
     def share(self) -> float:
         """Share of the frames of all cameras that are delivered."""
-        delivered = sum(camera.delivered for camera in self.cameras.values())
-        return delivered / self.frames if self.frames else 0.0
-
-    @property
-    def worst(self) -> str:
-        """Name of the camera with the smallest share; "" without cameras."""
-        return min(self.cameras, key=lambda name: self.cameras[name].share, default="")
+        return self.delivered / self.frames if self.frames else 0.0
 
     @property
     def text(self) -> str:
@@ -136,15 +135,15 @@ class Coverage:
             every = f"{every}, and {alone}" if self.share else f"{alone} of the frames"
         if self.share == 1.0 or len(self.cameras) < 2:
             return every
-        return f"{every}; {self.worst} {format_percent(self.cameras[self.worst].share, 1)}"
+        worst = min(self.cameras, key=lambda name: self.cameras[name].share)
+        return f"{every}; {worst} {format_percent(self.cameras[worst].share, 1)}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the coverage as plain JSON values, as in ``verdict.json``."""
         known = [camera.seconds for camera in self.cameras.values() if camera.seconds is not None]
-        delivered = sum(camera.delivered for camera in self.cameras.values())
         seconds = sum(known) if known and len(known) == len(self.cameras) else None
         return {
-            **_amounts(self.frames, delivered, seconds),
+            **_amounts(self.frames, self.delivered, seconds),
             "frames_in_other_maps": self.other_maps,
             "frames_rotation_only": self.rotation_only,
             "cameras": {name: camera.to_dict() for name, camera in self.cameras.items()},

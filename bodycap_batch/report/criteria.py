@@ -50,11 +50,6 @@ _CLOCK_RATIONALE = (
     "that were wrong by 0.5 and 0.2 s. A hand that moves at 1 m/s is 1 cm off if its clock is 10 ms off. Up "
     "to 10 ms is good; more than 40 ms, a frame of a cinema camera, is poor."
 )
-_SCALES_FINDING = "the scales from {sources} differ by a chi-square of {chi2:.1f} with {freedom} of freedom"
-_SCALES_RATIONALE = (
-    "Each scale has a stated uncertainty. If correct scales disagree so much in less than one capture of a "
-    "hundred, a bone length, a clock, the place of a camera or a part of the map is wrong."
-)
 _MORE_TEXTURE = (
     "Put up posters or patterned cloth where the cameras look, and pass the same places more than once."
 )
@@ -182,7 +177,7 @@ CAMERA_RULES = (
         read=readings.read_frozen,
         bounds=Bounds(good=0.0),
         unit="frames",
-        finding="{camera}: {value:,.0f} frames repeat one picture although the camera moves",
+        finding="{name}: {value:,.0f} frames repeat one picture although the camera moves",
         rationale="A recording that stops for a while often loses time as well: all later frames of this "
         "camera are then too early. Compare the picture with the other cameras after the frozen part.",
         action="Use a fast memory card and a fully charged battery, close other apps, and play the videos "
@@ -251,7 +246,7 @@ BODY_RULES = (
     ),
     Rule(
         name="Straps",
-        read=readings.read_slips,
+        read=readings.says("merge.slipped_mounts"),
         grade=Grade.FAIR,
         finding="{says}",
         rationale="The camera jumped to another place on the body from one frame to the next and stayed "
@@ -299,10 +294,11 @@ BODY_RULES = (
     ),
     Rule(
         name="Sources of the scale",
-        read=readings.chance("merge.scale", "sources"),
+        read=readings.read_scale_sources,
         bounds=Bounds(good=0.01, fair=0.0001, more_is_better=True),
-        finding=_SCALES_FINDING,
-        rationale=_SCALES_RATIONALE,
+        finding="the scales from {sources} differ by a chi-square of {chi2:.1f} with {freedom} of freedom",
+        rationale="Each scale has a stated uncertainty. If correct scales disagree so much in less than one "
+        "capture of a hundred, a bone length, a clock, the place of a camera or a part of the map is wrong.",
     ),
     Rule(
         name="Cameras in their usual places",
@@ -330,7 +326,7 @@ BODY_RULES = (
         read=readings.read_clock,
         bounds=Bounds(good=0.010, fair=0.040),
         unit="s",
-        finding="the clock of {camera} is known to {ms:.0f} ms, from the {source}",
+        finding="the clock of {name} is known to {ms:.0f} ms, from the {source}",
         rationale=_CLOCK_RATIONALE,
         action="Clap once, or hop once, while all cameras record with sound.",
         priority=1.3,

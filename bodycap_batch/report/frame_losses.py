@@ -1,68 +1,75 @@
-"""Find the intervals of lost frames, measure sharpness and rotation near them, and name the likely cause."""
+"""Find the spans of lost frames, measure sharpness and rotation near them, and name the likely cause."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from bodycap_batch.core.arrays import FloatArray, runs
+from bodycap_batch.core.arrays import FloatArray, evenly_spaced, runs
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.geometry import rotation_angle_rad
 from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
 from bodycap_batch.model.scene import FrameStatus, Trajectory
 from bodycap_batch.report.drawn_scene import common_times_s
-from bodycap_batch.report.frame_pictures import FrameAppearance
-from bodycap_batch.report.loss_causes import FAST_DEG, PLAIN_RATIO, LossCause
+from bodycap_batch.report.frame_pictures import FrameAppearance, measure_appearance
+from bodycap_batch.report.loss_causes import FAST_DEG, PLAIN_RATIO, LossCause, LostSpan
 from bodycap_batch.report.report_inputs import ReportInputs
 
 _NEIGHBOURS = 3
-"""Number of frame pairs on each side of a lost interval in which the rotation is measured.
+"""Number of frame pairs on each side of a lost span in which the rotation is measured. Evidence: none."""
+_REFERENCE_FRAMES = 5
+"""Number of registered frames of each camera that are compared with the camera's lost frames.
 
 Evidence: none.
 """
+MAX_LOSS_PICTURES = 24
+"""Maximum number of pictures of lost frames on the page: six rows of four pictures on a wide screen. Of each
+camera, no more frames are decoded."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FrameLoss:
-    """A lost interval: successive frames of one camera without a pose.
+def diagnose_losses(inputs: ReportInputs, context: StageContext) -> list[LostSpan]:
+    """Return the lost spans of all registered cameras with their likely causes, camera by camera.
 
-    Attributes:
-        camera: Camera name.
-        first: Index of the first frame.
-        last: Index of the last frame.
-        start_s: Common time of the first frame, seconds.
-        end_s: Common time of the last frame, seconds.
-        reason: The most frequent status of the frames.
-        sharpness: Ratio of the frames' median sharpness to the median sharpness of the camera's registered
-            frames; NaN if unknown.
-        turn_deg: Largest rotation between two successive registered frames near the interval, degrees; NaN if
-            there are no such frames.
+    The middle frame is decoded only for the longest spans of each camera.
     """
-
-    camera: str
-    first: int
-    last: int
-    start_s: float
-    end_s: float
-    reason: FrameStatus
-    sharpness: float
-    turn_deg: float
-
-    @property
-    def frame_count(self) -> int:
-        """Number of frames in the interval."""
-        return self.last - self.first + 1
-
-    @property
-    def middle(self) -> int:
-        """Index of the frame in the middle of the interval."""
-        return (self.first + self.last) // 2
+    losses = find_losses(inputs)
+    diagnosed = []
+    for name in inputs.cameras:
+        spans = [loss for loss in losses if loss.camera == name]
+        longest = sorted(spans, key=lambda span: -span.frames)[:MAX_LOSS_PICTURES]
+        appearances, usual_corners = _measure_frames(inputs, name, longest, context)
+        for span in spans:
+            appearance = appearances.get(span.middle)
+            cause = likely_cause(span, appearance, usual_corners)
+            diagnosed.append(replace(span, cause=cause, appearance=appearance))
+    return diagnosed
 
 
-def find_frame_losses(inputs: ReportInputs) -> list[FrameLoss]:
-    """Return the lost intervals of all registered cameras, camera by camera."""
+def _measure_frames(
+    inputs: ReportInputs, camera: str, losses: Sequence[LostSpan], context: StageContext
+) -> tuple[dict[int, FrameAppearance], float | None]:
+    """Measure the middle frames of lost spans, and a few registered frames of the same camera.
+
+    Returns:
+        The appearance of each measured frame, by frame index; and the median number of corners in the
+        registered frames, None if no registered frame was measured.
+    """
+    path = inputs.path(camera)
+    if not losses or path is None or inputs.capture is None:
+        return {}, None
+    localised = np.flatnonzero(path.localised)
+    reference = localised[evenly_spaced(len(localised), _REFERENCE_FRAMES)].tolist()
+    indices = [*(loss.middle for loss in losses), *reference]
+    appearances = measure_appearance(inputs.capture.camera(camera), indices, context)
+    corners = [appearances[index].corners for index in reference if index in appearances]
+    return appearances, float(np.median(corners)) if corners else None
+
+
+def find_losses(inputs: ReportInputs) -> list[LostSpan]:
+    """Return the lost spans of all registered cameras, without their causes."""
     return [
         loss
         for registration in inputs.registrations
@@ -82,13 +89,13 @@ _CAUSES_OF_REASONS = {
 
 
 def likely_cause(
-    loss: FrameLoss, appearance: FrameAppearance | None, usual_corners: float | None
+    loss: LostSpan, appearance: FrameAppearance | None, usual_corners: float | None
 ) -> LossCause:
-    """Return the likely cause of a lost interval.
+    """Return the likely cause of a lost span.
 
     Args:
-        loss: The lost interval.
-        appearance: Measurements of the interval's middle frame; None if this frame was not decoded.
+        loss: The lost span.
+        appearance: Measurements of the span's middle frame; None if this frame was not decoded.
         usual_corners: Median number of corners in the camera's registered frames; None if unknown.
     """
     if loss.reason in _CAUSES_OF_REASONS:
@@ -119,28 +126,30 @@ def turn_per_frame_deg(trajectory: Trajectory) -> FloatArray:
     return turn_deg
 
 
-def _camera_losses(inputs: ReportInputs, path: Trajectory) -> Iterator[FrameLoss]:
+def _camera_losses(inputs: ReportInputs, path: Trajectory) -> Iterator[LostSpan]:
     lost = ~path.localised
     times = common_times_s(inputs, path.camera, path.times_ns)
     selection = inputs.selection(path.camera)
-    sharpness = None if selection is None or lost.all() else selection.sharpness
-    usual_sharpness = np.nan if sharpness is None else float(np.median(sharpness[~lost]))
+    sharpness = np.full(len(lost), np.nan)
+    if (
+        selection is not None
+        and not lost.all()
+        and (usual := float(np.median(selection.sharpness[~lost]))) > 0
+    ):
+        sharpness = selection.sharpness / usual
     turns = turn_per_frame_deg(path)
     for first, stop in runs(lost):
         adjacent = np.concatenate(
             [turns[max(0, first - _NEIGHBOURS) : first], turns[stop - 1 : stop - 1 + _NEIGHBOURS]]
         )
         adjacent = adjacent[np.isfinite(adjacent)]
-        reasons = Counter(path.status[first:stop])
-        yield FrameLoss(
+        yield LostSpan(
             camera=path.camera,
             first=first,
-            last=stop - 1,
-            start_s=float(times[first]),
-            end_s=float(times[stop - 1]),
-            reason=reasons.most_common(1)[0][0],
-            sharpness=float(np.median(sharpness[first:stop])) / usual_sharpness
-            if sharpness is not None and usual_sharpness > 0
-            else float("nan"),
+            frames=stop - first,
+            from_s=float(times[first]),
+            to_s=float(times[stop - 1]),
+            reason=Counter(path.status[first:stop]).most_common(1)[0][0],
+            sharpness=float(np.median(sharpness[first:stop])),
             turn_deg=float(adjacent.max()) if len(adjacent) else float("nan"),
         )

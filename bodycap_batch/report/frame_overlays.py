@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.scene import Trajectory
-from bodycap_batch.overlay import BoneMotion, CameraView, make_camera_views, project_bones
+from bodycap_batch.overlay import CameraView, bones_from_motion, make_camera_views, project_bones
 from bodycap_batch.report.packing import pack_scaled
 from bodycap_batch.report.report_inputs import ReportInputs
 
@@ -37,7 +36,9 @@ class FrameOverlays:
         self._inputs = inputs
         views = make_camera_views(inputs.registrations, inputs.maps, inputs.clocks, inputs.merge)
         self._views = {view.camera: view for view in views}
-        self._bone_motion = None if inputs.merge is None else bones_from_merge(inputs.merge)
+        self._bone_motion = (
+            None if inputs.merge is None else bones_from_motion(inputs.merge.motion, inputs.merge.solved)
+        )
 
     def describe(self, camera: str, frames: Iterable[int]) -> list[dict[str, Any]]:
         """Describe frames of one camera as JSON values.
@@ -100,33 +101,6 @@ def _pose_facts(path: Trajectory | None, index: int) -> dict[str, Any]:
         "inliers": int(path.inliers[index]),
         "error": round(error, 3) if np.isfinite(error) else None,
     }
-
-
-def bones_from_merge(merge: MergeResult) -> BoneMotion:
-    """Return the moving bones between solved joints, from the solved motion `merge.motion`.
-
-    A solved joint at the end of a limb also gives the bone from the joint to the tip of the limb.
-    """
-    skeleton, poses, solved = merge.skeleton, merge.motion.world_from_joint(), merge.solved
-    centres = poses[..., :3, 3]
-    ends: list[FloatArray] = []
-    turning_joints: list[int] = []
-    for joint, parent in enumerate(skeleton.parents.tolist()):
-        if parent >= 0 and solved[joint] and solved[parent]:
-            ends.append(np.stack([centres[:, parent], centres[:, joint]], axis=1))
-            turning_joints.append(parent)
-        if solved[joint] and np.isfinite(skeleton.end_offsets_m[joint]).all():
-            tip = poses[:, joint, :3, :3] @ skeleton.end_offsets_m[joint] + centres[:, joint]
-            ends.append(np.stack([centres[:, joint], tip], axis=1))
-            turning_joints.append(joint)
-    joints = np.array(turning_joints, dtype=np.int64)
-    return BoneMotion(
-        joints=joints,
-        sides=("",) * len(ends),
-        times_ns=merge.times_ns(),
-        ends_in_world=np.stack(ends, axis=1) if ends else np.zeros((len(poses), 0, 2, 3)),
-        observed=merge.observed[:, joints],
-    )
 
 
 def _inlier_positions(view: CameraView | None, index: int) -> FloatArray:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from bodycap_batch.core.percent import format_percent
 from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
+from bodycap_batch.model.scene import FrameStatus
 from bodycap_batch.report.grades import Advice
+
+if TYPE_CHECKING:
+    from bodycap_batch.report.frame_pictures import FrameAppearance
 
 DARK_BRIGHTNESS = 30.0
 """Minimum mean brightness (0 to 255) of a frame that is not treated as dark. Evidence: none."""
@@ -52,20 +58,50 @@ class LostSpan:
 
     Attributes:
         camera: Camera name.
+        first: Index of the first frame.
+        frames: Number of frames.
         from_s: Common time of the first frame, seconds.
         to_s: Common time of the last frame, seconds.
-        frames: Number of frames.
+        reason: The most frequent status of the frames.
         cause: The likely cause.
+        sharpness: Ratio of the frames' median sharpness to the median sharpness of the camera's registered
+            frames; NaN if unknown.
+        turn_deg: Largest rotation between two successive registered frames near the span, degrees; NaN if
+            there are no such frames.
+        appearance: Appearance of the frame in the middle; None if it was not decoded.
     """
 
     camera: str
+    first: int = 0
+    frames: int
     from_s: float
     to_s: float
-    frames: int
-    cause: LossCause
+    reason: FrameStatus = FrameStatus.FEW_TRACKS
+    cause: LossCause = LossCause.UNKNOWN_PLACE
+    sharpness: float = math.nan
+    turn_deg: float = math.nan
+    appearance: FrameAppearance | None = None
+
+    @property
+    def last(self) -> int:
+        """Index of the last frame."""
+        return self.first + self.frames - 1
+
+    @property
+    def middle(self) -> int:
+        """Index of the frame in the middle."""
+        return (self.first + self.last) // 2
+
+    @property
+    def facts(self) -> str:
+        """What was measured in the frames, in words."""
+        facts = [] if math.isnan(self.sharpness) else [f"sharpness {format_percent(self.sharpness)}"]
+        facts += [] if math.isnan(self.turn_deg) else [f"turned {self.turn_deg:.0f}° per frame"]
+        facts += [] if self.appearance is None else [f"{self.appearance.corners} corners"]
+        return ", ".join(facts)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the span as plain JSON values."""
+        """Return the span as plain JSON values, as in ``verdict.json``."""
         return {
             "from_s": round(self.from_s, 3),
             "to_s": round(self.to_s, 3),

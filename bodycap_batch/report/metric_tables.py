@@ -103,17 +103,15 @@ def _group_table(
     if total:
         rows.append((Cell(text=total), *_value_cells(metrics, "total", columns[1:])))
     for number, column in enumerate(columns):
-        largest = max((row[number].value or 0.0 for row in rows), default=0.0) if column.bar else 0.0
-        if column.bar:
-            rows = [
-                (*row[:number], replace(row[number], share=_share(row[number], largest)), *row[number + 1 :])
-                for row in rows
-            ]
+        if column.bar and rows:
+            largest = max(row[number].value or 0.0 for row in rows) or 1.0
+            rows = [_with_bar(row, number, (row[number].value or 0.0) / largest) for row in rows]
     return Table(heads=tuple(column.head for column in columns), rows=tuple(rows), **words)
 
 
-def _share(cell: Cell, largest: float) -> float:
-    return (cell.value or 0.0) / largest if largest else 0.0
+def _with_bar(row: Sequence[Cell], number: int, share: float) -> tuple[Cell, ...]:
+    """Return a row with a bar behind the text of one cell."""
+    return (*row[:number], replace(row[number], share=share), *row[number + 1 :])
 
 
 def _value_cells(metrics: Mapping[str, Any], path: str, columns: Sequence[Column]) -> list[Cell]:
@@ -202,13 +200,7 @@ def make_tables(inputs: ReportInputs) -> dict[str, Table]:
     }
     if "merge" in metrics:
         tables |= _body_tables(metrics) | {"sigma": _joint_sigma_table(inputs)}
-    return {name: tables[name] for name in _ORDER if name in tables and tables[name].rows}
-
-
-_ORDER = (
-    "frames", "clocks", "shutters", "sensors", "map", "residuals", "joints", "hinges", "mounts", "joined",
-    "scale", "rules", "sigma", "flexion",
-)  # fmt: skip
+    return {name: table for name, table in tables.items() if table.rows}
 
 
 def _body_tables(metrics: Mapping[str, Any]) -> dict[str, Table]:
@@ -332,17 +324,16 @@ _READOUT_SOURCES = {
 def _shutters_table(metrics: Mapping[str, Any]) -> Table:
     """Return the readout time of each camera that is not stated to have a global shutter."""
     mapping = metrics.get("mapping", {})
-    paths: dict[str, tuple[str, ...]] = {}
-    for number, readouts in enumerate(mapping.get("rolling_shutter", ())):
-        for name in readouts:
-            paths.setdefault(name, ("mapping", "rolling_shutter", str(number), name))
-    for name in mapping.get("readouts_from_matches", {}):
-        paths.setdefault(name, ("mapping", "readouts_from_matches", name))
+    groups = [
+        f"mapping.rolling_shutter.{number}" for number in range(len(mapping.get("rolling_shutter", ())))
+    ]
+    groups.append("mapping.readouts_from_matches")
     rows = []
     for name in metrics["cameras"]:
-        if name not in paths:
+        places = (f"{group}.{metric_path(name)}" for group in groups)
+        path = next((place for place in places if metric_at(metrics, place) is not None), None)
+        if path is None:
             continue
-        path = metric_path(*paths[name])
         source = str(metric_at(metrics, f"{path}.source"))
         if source == "stated" and not metric_at(metrics, f"{path}.seconds"):
             continue
@@ -427,13 +418,7 @@ def _soft_limits_table(metrics: Mapping[str, Any]) -> Table:
         active = metric_cell(metrics, metric_path("merge", "activity", "rules_active", name), _percent)
         path = metric_path("merge", "activity", "rules_pressed_m", name)
         excess = [metric_cell(metrics, f"{path}.{key}", "{:.1f} cm", 100.0) for key in ("p50", "p95")]
-        rows.append(
-            (
-                Cell(text=_limit_text(str(name))),
-                replace(active, share=float(share)),
-                *excess,
-            )
-        )
+        rows.append((Cell(text=_limit_text(str(name))), replace(active, share=float(share)), *excess))
     return Table(
         caption="Soft limits: share of the time in which each limit was exceeded, and distance by which "
         "the limit was exceeded",
@@ -452,21 +437,15 @@ def _limit_text(name: str) -> str:
 
 def _joint_sigma_table(inputs: ReportInputs) -> Table:
     sigma = None if inputs.merge is None else known_joint_sigma_m(inputs.merge)
-    if inputs.merge is None or sigma is None:
-        return Table(caption="", heads=(), rows=())
-    rows = []
-    known = np.isfinite(sigma).any(axis=0)
-    largest = float(np.nanpercentile(sigma[:, known], 95, axis=0).max()) if known.any() else 0.0
-    for joint in np.flatnonzero(known):
-        median, p95 = np.nanpercentile(sigma[:, joint], [50, 95])
-        share = float(p95) / largest if largest else 0.0
-        rows.append(
-            (
-                Cell(text=inputs.merge.skeleton.joints[joint]),
-                Cell(text=f"{100 * median:.1f} cm"),
-                Cell(text=f"{100 * p95:.1f} cm", share=share),
+    rows: list[tuple[Cell, ...]] = []
+    if inputs.merge is not None and sigma is not None:
+        known = np.flatnonzero(np.isfinite(sigma).any(axis=0))
+        medians, highs = np.nanpercentile(sigma[:, known], [50, 95], axis=0).tolist()
+        for joint, median, high in zip(known.tolist(), medians, highs, strict=True):
+            bar = Cell(text=f"{100 * high:.1f} cm", share=high / max(highs) if max(highs) else 0.0)
+            rows.append(
+                (Cell(text=inputs.merge.skeleton.joints[joint]), Cell(text=f"{100 * median:.1f} cm"), bar)
             )
-        )
     return Table(
         caption="Uncertainty of each joint's position (one standard deviation)",
         heads=("Joint", "Median", "95 %"),
@@ -481,12 +460,9 @@ def headline_figures(metrics: Mapping[str, Any]) -> Iterable[tuple[str, Cell]]:
     yield "map error", metric_cell(metrics, "total.mean_reprojection_error_px", "{:.2f} px")
     yield "points in the map", metric_cell(metrics, "total.points")
     if "merge" in metrics:
-        worst = max(
-            metrics["merge"].get("cameras", {}).items(),
-            key=lambda item: item[1]["longest_gap_s"],
-            default=None,
-        )
-        if worst is not None:
-            path = metric_path("merge", "cameras", worst[0], "longest_gap_s")
+        cameras = metrics["merge"].get("cameras", {})
+        if cameras:
+            worst = max(cameras, key=lambda name: float(cameras[name]["longest_gap_s"]))
+            path = metric_path("merge", "cameras", worst, "longest_gap_s")
             yield "longest gap", metric_cell(metrics, path, "{:.2f} s")
         yield "metric scale", metric_cell(metrics, "merge.scale.relative_sigma", _sigma_percent)

@@ -67,13 +67,19 @@ def render_template(template: str, /, **context: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["code"] = _with_code
+    environment.filters |= {"code": _with_code, "clock": _clock_text}
     text = environment.get_template(template).render(**context, style=_template("style.css"))
     return text if text.endswith("\n") else f"{text}\n"
 
 
 def _template(name: str) -> str:
     return (files("bodycap_batch.report") / "templates" / name).read_text(encoding="utf-8")
+
+
+def _clock_text(time_s: float) -> str:
+    """Return a time as minutes, seconds and tenths: 1:02.5."""
+    tenths = round(10 * time_s)
+    return f"{'-' if tenths < 0 else ''}{abs(tenths) // 600}:{abs(tenths) % 600 / 10:04.1f}"
 
 
 def _with_code(text: str) -> Markup:

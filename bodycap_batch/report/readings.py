@@ -71,24 +71,26 @@ def at(path: str) -> Reader:
     return read
 
 
-def largest(group: str, *keys: str) -> Reader:
+def largest(group: str, *keys: str, where: Callable[[Any], Any] = bool) -> Reader:
     """Return a function that reads the largest value in a group, and the name of its entry.
 
     Args:
         group: Path of a mapping in ``metrics.json``.
         keys: Keys of the value in an entry. An entry without a value is ignored.
+        where: Returns whether an entry counts.
     """
 
     def read(metrics: Metrics) -> Reading | None:
         path = metric_path(*keys)
-        entries = (metric_at(metrics, group) or {}).items()
-        values = {name: value for name, each in entries if (value := metric_at(each, path)) is not None}
+        entries = {name: each for name, each in (metric_at(metrics, group) or {}).items() if where(each)}
+        values = {
+            name: value for name, each in entries.items() if (value := metric_at(each, path)) is not None
+        }
         name, value = _largest(values.items(), float)
         if value is None:
             return None
-        entry = metric_at(metrics, group)[name]
         place = f"{group}.{metric_path(name, *keys)}"
-        return Reading(value=float(value), metric=place, words={"name": name, **entry})
+        return Reading(value=float(value), metric=place, words={"name": name, **entries[name]})
 
     return read
 
@@ -98,44 +100,31 @@ def says(path: str) -> Reader:
 
     def read(metrics: Metrics) -> Reading | None:
         found = metric_at(metrics, path)
-        return Reading(words={"says": str(found["says"])}) if found else None
-
-    return read
-
-
-def read_slips(metrics: Metrics) -> Reading | None:
-    """Read which mounts slipped."""
-    found = metric_at(metrics, "merge.slipped_mounts")
-    if not found:
-        return None
-    return Reading(words={"says": str(found["says"]), "names": " and ".join(sorted(found["cameras"]))})
-
-
-def chance(path: str, sources: str) -> Reader:
-    """Return a function that reads how probable a disagreement between scales is, if all scales are correct.
-
-    Args:
-        path: Path of the entry with the chi-square.
-        sources: Key of the scales in this entry.
-    """
-
-    def read(metrics: Metrics) -> Reading | None:
-        scales = metric_at(metrics, path) or {}
-        freedom = int(scales.get("degrees_of_freedom") or 0)
-        if freedom < 1:
-            return None
-        from scipy.special import chdtrc  # scipy.stats takes a second to import.
-
-        return Reading(
-            value=float(chdtrc(freedom, float(scales["chi2"]))),
-            words={
-                "sources": " and ".join(source["name"] for source in scales.get(sources, ())),
-                "chi2": float(scales["chi2"]),
-                "freedom": f"{freedom} {'degree' if freedom == 1 else 'degrees'}",
-            },
+        return (
+            Reading(words={**found, "names": " and ".join(sorted(found.get("cameras", ())))})
+            if found
+            else None
         )
 
     return read
+
+
+def read_scale_sources(metrics: Metrics) -> Reading | None:
+    """Read how probable the disagreement between the scales is, if all scales are correct."""
+    scale = metric_at(metrics, "merge.scale") or {}
+    freedom = int(scale.get("degrees_of_freedom") or 0)
+    if freedom < 1:
+        return None
+    from scipy.special import chdtrc  # scipy.stats takes a second to import.
+
+    return Reading(
+        value=float(chdtrc(freedom, float(scale["chi2"]))),
+        words={
+            "sources": " and ".join(source["name"] for source in scale.get("sources", ())),
+            "chi2": float(scale["chi2"]),
+            "freedom": f"{freedom} {'degree' if freedom == 1 else 'degrees'}",
+        },
+    )
 
 
 def main_cameras(metrics: Metrics) -> dict[str, Any]:
@@ -346,14 +335,9 @@ def _lens_that_fits(factor: float) -> str:
     )
 
 
-def read_frozen(metrics: Metrics) -> Reading | None:
-    """Read the largest number of frames that repeat one picture."""
-    counts = {name: int(each.get("status", {}).get("FROZEN", 0)) for name, each in metrics["cameras"].items()}
-    name, count = _largest(counts.items(), float)
-    if not count:
-        return None
-    path = metric_path("cameras", name, "status", "FROZEN")
-    return Reading(value=float(count), metric=path, words={"camera": name})
+read_frozen = largest(
+    "cameras", "status", "FROZEN", where=lambda camera: camera.get("status", {}).get("FROZEN")
+)
 
 
 def read_skeleton(metrics: Metrics) -> Reading | None:
@@ -451,14 +435,5 @@ def read_contradicted_clocks(metrics: Metrics) -> Reading | None:
 
 def read_clock(metrics: Metrics) -> Reading | None:
     """Read the largest sigma (seconds) of an estimated clock offset."""
-    estimated = {
-        name: clock
-        for name, clock in metrics.get("clocks", {}).items()
-        if clock["source"] in ESTIMATED_SOURCES
-    }
-    name, worst = _largest(estimated.items(), lambda clock: float(clock["sigma_s"]))
-    if worst is None or metrics.get("contradicted_clocks"):
-        return None
-    path = metric_path("clocks", name, "sigma_s")
-    words = {"camera": name, "ms": 1000 * float(worst["sigma_s"]), "source": worst["source"]}
-    return Reading(value=float(worst["sigma_s"]), metric=path, words=words)
+    read = largest("clocks", "sigma_s", where=lambda clock: clock["source"] in ESTIMATED_SOURCES)
+    return None if metrics.get("contradicted_clocks") else read(metrics)

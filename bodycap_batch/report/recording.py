@@ -12,8 +12,8 @@ from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.palette import Colour, camera_colours
 from bodycap_batch.model.geometry import quat_xyzw_from_rotation
 from bodycap_batch.model.merge_data import MergeResult
+from bodycap_batch.overlay import bones_from_motion
 from bodycap_batch.report.drawn_scene import DrawnPath, DrawnScene, make_drawn_scene
-from bodycap_batch.report.frame_overlays import bones_from_merge
 from bodycap_batch.report.report_inputs import ReportInputs
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def _log_path(stream: rr.RecordingStream, path: DrawnPath, colour: Colour) -> No
 def _log_body(stream: rr.RecordingStream, merge: MergeResult) -> None:
     import rerun as rr
 
-    bones = bones_from_merge(merge)
+    bones = bones_from_motion(merge.motion, merge.solved)
     for time_ns, ends in zip(bones.times_ns.tolist(), bones.ends_in_world, strict=True):
         stream.set_time("time", duration=1e-9 * time_ns)
         stream.log("world/body", rr.LineStrips3D(list[FloatArray](ends)))

@@ -13,9 +13,9 @@ from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.formats.palette import camera_colours, hex_from_colour
 from bodycap_batch.report.content import page_content
 from bodycap_batch.report.drawn_scene import common_times_s, make_drawn_scene
+from bodycap_batch.report.frame_losses import diagnose_losses
 from bodycap_batch.report.frame_overlays import FrameOverlays
 from bodycap_batch.report.frame_pictures import SERIES_BUDGET, picture_series
-from bodycap_batch.report.loss_diagnosis import diagnose_losses, spans_of
 from bodycap_batch.report.packing import PageBudget
 from bodycap_batch.report.page import render_page
 from bodycap_batch.report.report_inputs import ReportInputs
@@ -51,7 +51,7 @@ def write_report(inputs: ReportInputs, path: Path, context: StageContext) -> Non
     colours = {name: hex_from_colour(colour) for name, colour in camera_colours(inputs.cameras).items()}
     context.progress(0, 3, "pictures")
     losses = diagnose_losses(inputs, context)
-    verdict = judge(inputs.metrics, inputs.failure, spans_of(losses))
+    verdict = judge(inputs.metrics, inputs.failure, losses)
     write_text(
         path.with_name(VERDICT_FILE), json.dumps(verdict.to_dict(), indent=1, ensure_ascii=False) + "\n"
     )

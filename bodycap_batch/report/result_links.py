@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import PurePosixPath
+from typing import NamedTuple
 
 _FILES = {
     "motion.bvh": ("the motion", "Blender, MotionBuilder, 3ds Max, retargeters"),
@@ -33,15 +33,23 @@ _FILES = {
     "metrics.json": ("all figures of this page", "any program that reads JSON"),
 }
 """Content of each result file, and what opens it, by file name. The order is that of the page."""
+_PATTERNS = {
+    "*_far.ply": ("points that are far away: their depth is uncertain", "MeshLab, CloudCompare"),
+    "map_*.ply": ("a map that could not be placed", "MeshLab"),
+    "*.tum": ("the path of camera {stem}", "evo, any editor"),
+    "*.chan": ("the animated camera {stem}", "Nuke"),
+    "*.abc": ("the animated camera {stem}", "Nuke, Maya, Houdini, Blender"),
+    "colmap/*/cameras.bin": ("a map as a COLMAP model", "COLMAP, nerfstudio"),
+}
+"""The same for files that a job can have several of, by pattern; the first pattern that matches counts."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ResultLink:
+class ResultLink(NamedTuple):
     """A result file on the page.
 
     Attributes:
-        path: Path of the file, relative to the page.
-        content: What is in the file.
+        path: Path of the file or folder, relative to the page.
+        content: What is in it.
         opens_in: Programs that open it.
     """
 
@@ -51,35 +59,17 @@ class ResultLink:
 
 
 def describe_files(paths: Iterable[str]) -> list[ResultLink]:
-    """Return the result files with their descriptions; files of one kind in folders are one entry.
+    """Return the result files with their descriptions; the files of a COLMAP model are one entry.
 
     Args:
         paths: Paths of the files, relative to the results folder.
     """
     names = sorted(paths)
-    out = [
-        ResultLink(path=name, content=content, opens_in=programs)
-        for name, (content, programs) in _FILES.items()
-        if name in names
-    ]
-    for name in names:
-        folder = PurePosixPath(name)
-        if folder.stem.endswith("_far") and folder.suffix == ".ply":
-            content = "points that are far away: their depth is uncertain"
-            out.append(ResultLink(path=name, content=content, opens_in="MeshLab, CloudCompare"))
-        elif name.startswith("map_") and folder.suffix == ".ply":
-            out.append(ResultLink(path=name, content="a map that could not be placed", opens_in="MeshLab"))
-        elif folder.suffix == ".tum":
-            out.append(
-                ResultLink(path=name, content=f"the path of camera {folder.stem}", opens_in="evo, any editor")
-            )
-        elif folder.suffix in (".chan", ".abc"):
-            opens_in = "Nuke" if folder.suffix == ".chan" else "Nuke, Maya, Houdini, Blender"
-            out.append(ResultLink(path=name, content=f"the animated camera {folder.stem}", opens_in=opens_in))
-        elif folder.parts[0] == "colmap" and folder.name == "cameras.bin":
-            out.append(
-                ResultLink(
-                    path=f"{folder.parent}/", content="a map as a COLMAP model", opens_in="COLMAP, nerfstudio"
-                )
-            )
-    return out
+    links = [ResultLink(name, *words) for name, words in _FILES.items() if name in names]
+    for path in map(PurePosixPath, names):
+        pattern = next((pattern for pattern in _PATTERNS if path.match(pattern)), None)
+        if pattern is not None:
+            content, opens_in = _PATTERNS[pattern]
+            place = f"{path.parent}/" if path.parts[0] == "colmap" else str(path)
+            links.append(ResultLink(place, content.format(stem=path.stem), opens_in))
+    return links

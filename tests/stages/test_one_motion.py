@@ -23,7 +23,6 @@ from bodycap_batch.formats.usd import read_usd
 from bodycap_batch.model.skeleton import Motion
 from bodycap_batch.overlay import bones_from_motion
 from bodycap_batch.report.drawn_scene import make_drawn_scene
-from bodycap_batch.report.frame_overlays import bones_from_merge
 from bodycap_batch.report.packing import PageBudget
 from bodycap_batch.report.viewer_data import make_viewer_data
 from tests.bodies import ARMS
@@ -153,6 +152,6 @@ def test_pictures_and_video_show_the_motion() -> None:
     merge = report_inputs().merge
     assert merge is not None
     poses = merge.motion.world_from_joint()
-    for body in (bones_from_merge(merge), bones_from_motion(merge.motion)):
+    for body in (bones_from_motion(merge.motion, merge.solved), bones_from_motion(merge.motion)):
         off = body.ends_in_world[:, :, 0] - poses[..., :3, 3][:, body.joints]
         assert np.linalg.norm(off, axis=-1).max() < TOLERANCE_M

@@ -12,8 +12,8 @@ import rerun as rr
 
 from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.palette import Colour, camera_colours
+from bodycap_batch.overlay import bones_from_motion
 from bodycap_batch.report import ReportInputs
-from bodycap_batch.report.frame_overlays import bones_from_merge
 from bodycap_batch.report.recording import write_recording
 from bodycap_batch.runner import NotStored
 from tests.reports import report_inputs
@@ -78,7 +78,9 @@ def test_the_body_is_the_solved_one(
     write_recording(inputs, tmp_path / "walk.rrd")
     assert inputs.merge is not None
     np.testing.assert_allclose(log.times, inputs.merge.times_ns() * 1e-9)
-    np.testing.assert_array_equal(log.strips["world/body"], bones_from_merge(inputs.merge).ends_in_world)
+    np.testing.assert_array_equal(
+        log.strips["world/body"], bones_from_motion(inputs.merge.motion, inputs.merge.solved).ends_in_world
+    )
     # The body walks at 1.1 m/s for 39 ticks of 1/30 s; an in-place animation would not move.
     bones = np.array(log.strips["world/body"])
     assert np.linalg.norm(bones[-1] - bones[0], axis=-1).min() > 1.0

@@ -27,9 +27,10 @@ from bodycap_batch.report import ReportInputs
 from bodycap_batch.report.advice import count_shared_points, recommend_changes
 from bodycap_batch.report.drawn_scene import common_times_s, make_drawn_scene
 from bodycap_batch.report.figures.before_after import find_unoptimised_bones
-from bodycap_batch.report.figures.camera_timeline import draw_camera_timeline, x_from_time
+from bodycap_batch.report.figures.camera_timeline import draw_camera_timeline
+from bodycap_batch.report.figures.time_axis import x_from_time
 from bodycap_batch.report.frame_losses import (
-    find_frame_losses,
+    find_losses,
     likely_cause,
 )
 from bodycap_batch.report.frame_pictures import FrameAppearance, FramePicture
@@ -629,7 +630,7 @@ def test_a_camera_timeline_of_any_length_stays_small(inputs: ReportInputs) -> No
         error_px=np.where(kept, 0.5, np.nan),
     )
     long = replace(inputs, registrations=(replace(found, trajectory=path),), merge=None, selections=())
-    losses = find_frame_losses(long)
+    losses = find_losses(long)
     assert len(losses) == count // 2
     drawn = draw_camera_timeline(long, path.camera, (0.0, count / 30.0), losses, 0.0)
     assert len(drawn) < 150_000
@@ -718,17 +719,17 @@ def test_a_camera_with_poses_outside_the_motion_does_not_break_the_page(
 
 
 def test_losses_are_found_with_measurements_next_to_them(inputs: ReportInputs) -> None:
-    losses = find_frame_losses(inputs)
+    losses = find_losses(inputs)
     assert len(losses) == 3
     for loss in losses:
-        assert (loss.first, loss.last, loss.frame_count) == (20, 24, 5)
+        assert (loss.first, loss.last, loss.frames) == (20, 24, 5)
         assert loss.reason is FrameStatus.BLUR
         # The sharpness is 3 to 4 in lost frames and 10 to 11 in the others.
         assert 0.27 < loss.sharpness < 0.4
 
 
 def test_likely_causes_follow_the_measurements(inputs: ReportInputs) -> None:
-    loss = find_frame_losses(inputs)[0]
+    loss = find_losses(inputs)[0]
 
     def appearance(grey: float, corners: int) -> FrameAppearance:
         return FrameAppearance(

@@ -6,20 +6,21 @@ Source: M. Vo, Kim, Choudhary, "Motion Capture using Body Mounted Cameras in an 
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
-from bodycap_batch.model.geometry import interpolate_pose, invert
+from bodycap_batch.model.geometry import invert, poses_at
 from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.report.figures.svg import element, path_through, svg_image, text
 from bodycap_batch.report.report_inputs import ReportInputs
 
 _COLUMNS = 4
 """Number of times at which the skeleton is drawn, side by side."""
-_MAX_INTERVAL_S = 0.1
-"""Maximum time (seconds) between two measured poses for interpolation between them.
+_MAX_INTERVAL_NS = 100_000_000
+"""Maximum time (nanoseconds) between two measured poses for interpolation between them.
 
 This is the duration of three frames of a camera with 30 fps.
 """
@@ -75,26 +76,18 @@ def find_unoptimised_bones(inputs: ReportInputs) -> list[UnoptimisedBone]:
         path = inputs.path(mount.camera)
         if joint is None or path is None or path.gauge != "world":
             continue
-        times = inputs.clocks[mount.camera].common_times_ns(path.times_ns)[path.localised]
-        poses = path.gauge_from_cam[path.localised]
-        ticks = merge.times_ns()
-        if len(times) == 0:
+        times_ns = inputs.clocks[mount.camera].common_times_ns(path.times_ns)[path.localised]
+        world_from_cam, measured = poses_at(
+            times_ns, path.gauge_from_cam[path.localised], merge.times_ns(), max_gap_ns=_MAX_INTERVAL_NS
+        )
+        if not measured.any():
             continue
-        right = np.clip(np.searchsorted(times, ticks), 0, len(times) - 1)
-        left = np.where(times[right] == ticks, right, np.maximum(right - 1, 0))
-        interval = times[right] - times[left]
-        inside = (ticks >= times[0]) & (ticks <= times[-1]) & (interval <= _MAX_INTERVAL_S * 1e9)
-        measured_ticks = np.flatnonzero(inside)
-        if len(measured_ticks) == 0:
-            continue
-        alpha = (ticks - times[left])[measured_ticks] / np.maximum(interval[measured_ticks], 1)
-        world_from_cam = interpolate_pose(poses[left[measured_ticks]], poses[right[measured_ticks]], alpha)
         bones.append(
             UnoptimisedBone(
                 camera=mount.camera,
                 joint=joint,
-                ticks=measured_ticks,
-                world_from_joint=world_from_cam @ invert(mount.joint_from_cam),
+                ticks=np.flatnonzero(measured),
+                world_from_joint=world_from_cam[measured] @ invert(mount.joint_from_cam),
             )
         )
     return bones
@@ -117,12 +110,8 @@ def draw_before_and_after(inputs: ReportInputs, colours: dict[str, str]) -> str:
     bones = find_unoptimised_bones(inputs)
     if merge is None or not bones:
         return ""
-    common_ticks = bones[0].ticks
-    for bone in bones[1:]:
-        common_ticks = np.intersect1d(common_ticks, bone.ticks)
+    common_ticks = functools.reduce(np.intersect1d, [bone.ticks for bone in bones])
     ticks = common_ticks if len(common_ticks) >= _COLUMNS else bones[0].ticks
-    if len(ticks) == 0:
-        return ""
     chosen = ticks[np.linspace(0, len(ticks) - 1, _COLUMNS + 2)[1:-1].round().astype(int)]
     poses = merge.motion.world_from_joint()[chosen]
     parts = [
@@ -141,66 +130,40 @@ def _draw_tick(
     column: int,
     colours: dict[str, str],
 ) -> str:
-    root = world_from_joint[0]
+    root, skeleton = world_from_joint[0], merge.skeleton
     left = root[:3, 0] * [1.0, 1.0, 0.0]
     across = left / max(float(np.linalg.norm(left)), 1e-9)
 
-    def to_drawing(points: FloatArray) -> list[tuple[float, float]]:
+    def to_drawing(points: FloatArray) -> FloatArray:
         # Viewed from the front, the body's left side appears on the right.
         x = (points - root[:3, 3]) @ across * _UNITS_PER_M + (column + 0.5) * _CELL_WIDTH
-        y = 18.0 + (_TOP_HEIGHT_M - points[:, 2]) * _UNITS_PER_M
-        return list(zip(x.tolist(), y.tolist(), strict=True))
+        return np.stack([x, 18.0 + (_TOP_HEIGHT_M - points[:, 2]) * _UNITS_PER_M], axis=1)
 
-    skeleton, parts = merge.skeleton, []
-    for joint, parent in enumerate(skeleton.parents):
-        if parent >= 0:
-            ends = world_from_joint[[parent, joint], :3, 3]
-            style_class = "bone" if merge.solved[joint] and merge.solved[parent] else "bone guessed"
-            parts.append(element("path", class_=style_class, d=path_through(to_drawing(ends))))
-    for joint in np.flatnonzero(np.isfinite(skeleton.end_offsets_m).all(axis=1)).tolist():
-        style_class = "bone" if merge.solved[joint] else "bone guessed"
-        ends = _bone_ends(world_from_joint[joint], skeleton.end_offsets_m[joint])
-        parts.append(element("path", class_=style_class, d=path_through(to_drawing(ends))))
+    def draw_bone(pose: FloatArray, offset_m: FloatArray, kind: str, style: str | None = None) -> str:
+        """Draw a bone from its joint to an offset in the frame of the joint."""
+        line = path_through(to_drawing(np.stack([pose[:3, 3], pose[:3, :3] @ offset_m + pose[:3, 3]])))
+        return element("path", class_=kind, style=style, d=line)
+
+    segments = [
+        (parent, skeleton.offsets_m[joint], merge.solved[joint] and merge.solved[parent])
+        for joint, parent in enumerate(skeleton.parents)
+        if parent >= 0
+    ]
+    segments += [
+        (joint, skeleton.end_offsets_m[joint], merge.solved[joint])
+        for joint in np.flatnonzero(np.isfinite(skeleton.end_offsets_m).all(axis=1))
+    ]
+    parts = [
+        draw_bone(world_from_joint[joint], offset_m, "bone" if is_solved else "bone guessed")
+        for joint, offset_m, is_solved in segments
+    ]
     for bone in bones:
-        index = np.flatnonzero(bone.ticks == tick)
-        if len(index) == 0:
-            continue
-        pose, colour = bone.world_from_joint[index[0]], colours[bone.camera]
-        for offset in _far_end_offsets(merge, bone.joint):
-            parts.append(
-                element(
-                    "path",
-                    class_="bone before",
-                    style=f"stroke:{colour}",
-                    d=path_through(to_drawing(_bone_ends(pose, offset))),
-                )
-            )
-        x, y = to_drawing(pose[None, :3, 3])[0]
-        parts.append(element("circle", cx=x, cy=y, r=3.5, fill=colour))
-    seconds = merge.times_ns()[tick] * 1e-9
-    middle = (column + 0.5) * _CELL_WIDTH
-    return "".join(parts) + text(
-        middle, _CELL_HEIGHT + 18.0, f"{seconds:.2f} s", class_="tick", text_anchor="middle"
-    )
-
-
-def _bone_ends(pose: FloatArray, offset: FloatArray) -> FloatArray:
-    """Return the two ends (2,3) of a bone, first the end at the joint.
-
-    Args:
-        pose: (4,4) pose of the joint.
-        offset: (3,) offset of the far end in the frame of the joint.
-    """
-    return np.stack([pose[:3, 3], pose[:3, :3] @ offset + pose[:3, 3]])
-
-
-def _far_end_offsets(merge: MergeResult, joint: int) -> list[FloatArray]:
-    """Return the offsets (3,) of a joint's children, in the frame of the joint.
-
-    For a joint without children, return the offset of the tip of its bone.
-    """
-    skeleton = merge.skeleton
-    children = np.flatnonzero(skeleton.parents == joint)
-    if len(children):
-        return [skeleton.offsets_m[child] for child in children]
-    return [skeleton.end_offsets_m[joint]]
+        for pose in bone.world_from_joint[bone.ticks == tick]:
+            colour = colours[bone.camera]
+            offsets = skeleton.offsets_m[skeleton.parents == bone.joint]
+            for offset in offsets if len(offsets) else skeleton.end_offsets_m[[bone.joint]]:
+                parts.append(draw_bone(pose, offset, "bone before", f"stroke:{colour}"))
+            x, y = to_drawing(pose[None, :3, 3])[0].tolist()
+            parts.append(element("circle", cx=x, cy=y, r=3.5, fill=colour))
+    middle, words = (column + 0.5) * _CELL_WIDTH, f"{merge.times_ns()[tick] * 1e-9:.2f} s"
+    return "".join(parts) + text(middle, _CELL_HEIGHT + 18.0, words, class_="tick", text_anchor="middle")

@@ -6,27 +6,27 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.model.bone_axes import bone_ends_m, has_floor_root
+from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.measured_parts import PartState, overall_state
 from bodycap_batch.model.skeleton import Motion, rest_pose
 from bodycap_batch.model.skeleton_presets import split_side
 from bodycap_batch.report.figures.svg import element, svg_image
 
 _WIDTH, _HEIGHT, _MARGIN = 168.0, 250.0, 16.0
 """Size of the drawing and its margin, SVG units."""
-_THICKNESS = {
-    "Hand": 9.0,
-    "Foot": 10.0,
-    "ToeBase": 8.0,
-    "Neck": 11.0,
-    "Shoulder": 11.0,
-    "Hips": 24.0,
-    "Spine": 24.0,
-    "Spine1": 26.0,
+_CLASSES = {
+    PartState.MEASURED: "measured",
+    PartState.PARTLY: "partly",
+    PartState.FILLED: "filled",
+    PartState.UNMEASURED: "unknown",
 }
-"""Thickness of some bones, SVG units; 14 for the others. Evidence: none."""
+"""Class of a bone in the style sheet, by its state."""
+_THIN = {"Hand": 9.0, "Foot": 10.0, "ToeBase": 8.0, "Neck": 11.0, "Shoulder": 11.0}
+_THICKNESS = _THIN | {"Hips": 24.0, "Spine": 24.0, "Spine1": 26.0}
+"""Thickness of some bones, SVG units. It is a matter of taste."""
 _THICK = 14.0
-"""Thickness of all other bones, SVG units. Evidence: none."""
-_WHOLE, _PART = 0.95, 0.05
-"""Share of ticks from which a bone counts as measured, and up to which as not measured. Evidence: none."""
+"""Thickness of all other bones, SVG units."""
+_ARM = ("Arm", "ForeArm", "Hand")
 _MIN_BONE_STATURE = 0.03
 """Shortest bone that is drawn, as a share of the drawn height. Evidence: none."""
 
@@ -43,7 +43,7 @@ def draw_pictogram(motion: Motion, filled: BoolArray) -> str:
     """
     skeleton = motion.skeleton
     at, ends = rest_pose(skeleton)[:, :3, 3], bone_ends_m(skeleton)
-    share = motion.observed.mean(axis=0)
+    share = motion.observed.mean(axis=0).tolist()
     flat_at, flat_ends = _lowered(skeleton.roles, at, ends)
     low, high = float(min(at[:, 2].min(), ends[:, 2].min())), float(max(at[:, 2].max(), ends[:, 2].max()))
     scale = (_HEIGHT - 2 * _MARGIN) / max(high - low, 1e-6)
@@ -57,18 +57,10 @@ def draw_pictogram(motion: Motion, filled: BoolArray) -> str:
         if (joint == 0 and has_floor_root(skeleton)) or not role:
             continue
         (x1, y1), (x2, y2) = on_page(flat_at[joint]), on_page(flat_ends[joint])
-        kind = _kind(float(share[joint]), bool(filled[joint]))
+        kind = _CLASSES[overall_state(share[joint], share[joint], is_filled=bool(filled[joint]))]
         if role == "Head":
-            parts.append(
-                element(
-                    "ellipse",
-                    class_=kind,
-                    cx=(x1 + x2) / 2,
-                    cy=(y1 + y2) / 2,
-                    rx=11.0,
-                    ry=abs(y2 - y1) / 2 + 4,
-                )
-            )
+            centre = {"cx": (x1 + x2) / 2, "cy": (y1 + y2) / 2}
+            parts.append(element("ellipse", class_=kind, **centre, rx=11.0, ry=abs(y2 - y1) / 2 + 4))
         elif np.hypot(x2 - x1, y2 - y1) > _MIN_BONE_STATURE * scale:
             thick = _THICKNESS.get(split_side(role)[1], _THICK)
             parts.append(element("line", class_=kind, x1=x1, y1=y1, x2=x2, y2=y2, stroke_width=thick))
@@ -80,29 +72,16 @@ def draw_pictogram(motion: Motion, filled: BoolArray) -> str:
 def _lowered(roles: tuple[str, ...], at: FloatArray, ends: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return starts and ends of the bones with each arm turned about its shoulder towards the hips."""
     at, ends = at.copy(), ends.copy()
-    for side, turn in (("Left", -1.0), ("Right", 1.0)):
+    for side, angle_deg in (("Left", -68.0), ("Right", -112.0)):
         arm = [
-            j
-            for j, role in enumerate(roles)
-            if split_side(role) in ((side, p) for p in ("Arm", "ForeArm", "Hand"))
+            joint for joint, role in enumerate(roles) if split_side(role) in {(side, part) for part in _ARM}
         ]
         if not arm:
             continue
         pivot = at[arm[0]].copy()
         way = ends[arm[-1]] - pivot
-        now = np.arctan2(way[2], way[0])
-        wanted = np.radians(-68.0 if turn < 0 else -112.0)
-        angle = wanted - now
-        c, s = np.cos(angle), np.sin(angle)
-        rotation = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+        turn_rad = np.radians(angle_deg) - np.arctan2(way[2], way[0])
+        rotation = so3_exp([0.0, -turn_rad, 0.0])
         for array in (at, ends):
             array[arm] = (array[arm] - pivot) @ rotation.T + pivot
     return at, ends
-
-
-def _kind(share: float, is_filled: bool) -> str:
-    if share >= _WHOLE:
-        return "measured"
-    if share > _PART:
-        return "partly"
-    return "filled" if is_filled else "unknown"

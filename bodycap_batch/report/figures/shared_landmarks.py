@@ -45,44 +45,10 @@ def draw_shared_landmarks(inputs: ReportInputs) -> str:
     for row, name in enumerate(names):
         y = _TOP + row * _CELL * _ASPECT
         parts.append(text(_LEFT - 8.0, y + 0.36 * _CELL, name, class_="label", text_anchor="end"))
+        own = int(counts[row, row])
         for column, other in enumerate(names):
-            own = max(int(counts[row, row]), 1)
-            share = counts[row, column] / own
-            description = (
-                f"{name} sees {counts[row, row]:,} points"
-                if row == column
-                else f"{name} and {other} both see {counts[row, column]:,} points, which are "
-                f"{format_percent(share)} of the points of {name}"
-            )
-            x = _LEFT + column * _CELL
-            opacity = 0.06 + 0.9 * min(share / _FULL_SHADE_SHARE, 1.0)
-            parts.append(
-                element(
-                    "rect",
-                    element("title", html.escape(description)),
-                    class_="own" if row == column else "cell",
-                    style=None if row == column else f"fill-opacity:{opacity:.3f}",
-                    x=x + 1.0,
-                    y=y + 1.0,
-                    width=_CELL - 2.0,
-                    height=_ASPECT * _CELL - 2.0,
-                )
-            )
-            middle = x + 0.5 * _CELL
-            is_strong = row != column and share > _STRONG_TEXT_SHARE
-            text_class = "cellnumber strong" if is_strong else "cellnumber"
-            count_text = f"{counts[row, column]:,}"
-            parts.append(text(middle, y + 0.3 * _CELL, count_text, class_=text_class, text_anchor="middle"))
-            if row != column:
-                parts.append(
-                    text(
-                        middle,
-                        y + 0.3 * _CELL + 13.0,
-                        f"{format_percent(share)}",
-                        class_=f"{text_class} small",
-                        text_anchor="middle",
-                    )
-                )
+            common, x = int(counts[row, column]), _LEFT + column * _CELL
+            parts.append(_draw_cell(x, y, name, other, own, common))
     size = len(names)
     omission = (
         f" (the first {_MAX_CAMERAS} of {len(inputs.cameras)})" if len(inputs.cameras) > _MAX_CAMERAS else ""
@@ -93,6 +59,30 @@ def draw_shared_landmarks(inputs: ReportInputs) -> str:
         "".join(parts),
         f"Landmarks shared between cameras{omission}",
         class_="shared",
+    )
+
+
+def _draw_cell(x: float, y: float, name: str, other: str, own: int, common: int) -> str:
+    """Draw how many of the `own` points of a camera another camera, or the camera itself, sees."""
+    share, style, kind = common / max(own, 1), None, "own"
+    description, strong = f"{name} sees {own:,} points", ""
+    numbers = [f"{common:,}"]
+    if name != other:
+        description = (
+            f"{name} and {other} both see {common:,} points, which are {format_percent(share)} of the points "
+            f"of {name}"
+        )
+        kind, style = "cell", f"fill-opacity:{0.06 + 0.9 * min(share / _FULL_SHADE_SHARE, 1.0):.3f}"
+        strong = " strong" if share > _STRONG_TEXT_SHARE else ""
+        numbers.append(format_percent(share))
+    place = {"x": x + 1.0, "y": y + 1.0, "width": _CELL - 2.0, "height": _ASPECT * _CELL - 2.0}
+    rect = element("rect", element("title", html.escape(description)), class_=kind, style=style, **place)
+    classes = (f"cellnumber{strong}", f"cellnumber{strong} small")
+    return rect + "".join(
+        text(
+            x + 0.5 * _CELL, y + 0.3 * _CELL + 13.0 * line, words, class_=classes[line], text_anchor="middle"
+        )
+        for line, words in enumerate(numbers)
     )
 
 

@@ -53,7 +53,7 @@ def svg_image(width: float, height: float, content: str, title: str, **attribute
     )
 
 
-def path_through(points: Iterable[tuple[float, float]]) -> str:
+def path_through(points: Iterable[Iterable[float]]) -> str:
     """Return SVG path data of a line through points. A point that is not finite interrupts the line."""
     out, pen_up = [], True
     for x, y in points:
