@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import bodycap_batch
-from bodycap_batch.core.errors import StoreError
 from bodycap_batch.formats.atomic_files import atomic_replacement, write_text
 from bodycap_batch.formats.blender.scene_script import SCENE_FILE, SCRIPT_FILE
 from bodycap_batch.formats.fbx.blender_process import run_script
@@ -81,12 +80,7 @@ def write_blend(path: Path) -> Path:
     """
     with tempfile.TemporaryDirectory() as folder:
         temporary = Path(folder) / path.name
-        done = run_script(path.parent / SCRIPT_FILE, ["--save", str(temporary)])
-        if done.returncode != 0 or not temporary.is_file():
-            last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
-            raise StoreError(
-                f"Blender could not write the file: {last}", path=path, hint="check the disk for errors"
-            )
+        run_script(path.parent / SCRIPT_FILE, ["--save", str(temporary)], made=temporary, path=path)
         with atomic_replacement(path) as target:
             target.write_bytes(temporary.read_bytes())
     return path
