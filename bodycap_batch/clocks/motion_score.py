@@ -35,13 +35,11 @@ class MotionScore:
     Attributes:
         lags_s: (L,) offsets: time of the first camera − time of the second, seconds.
         common_s: (L,) time in which both cameras were localised, seconds.
-        parts: (P,L) parts of the logarithm of the likelihood for one independent sample per second.
         score: (L,) logarithm of the likelihood, relative to that of a typical offset.
     """
 
     lags_s: FloatArray
     common_s: FloatArray
-    parts: FloatArray
     score: FloatArray
 
 
@@ -66,7 +64,7 @@ def motion_score(
     """
     sums = _LagSums(first, second, min_common_s, limits_s)
     if not sums.chosen.any():
-        return MotionScore(np.zeros(0), np.zeros(0), np.zeros((len(weights_hz), 0)), np.zeros(0))
+        return MotionScore(*np.zeros((3, 0)))
     cam_from_map = first.map_from_cam.transpose(1, 0, 2)
     middle = (first.position * first.present).sum(axis=1) / first.present.sum()
     at, other_at = first.position - middle[:, None], second.position - middle[:, None]
@@ -102,7 +100,7 @@ def motion_score(
     stacked = np.array(parts)
     # An offset with a long common time is not better for the only reason that motions resemble each other.
     stacked = np.asarray((stacked - np.median(stacked, axis=1)[:, None]) * sums.common)
-    return MotionScore(sums.lags_s, sums.common, stacked, np.asarray(np.array(weights_hz) @ stacked))
+    return MotionScore(sums.lags_s, sums.common, np.asarray(np.array(weights_hz) @ stacked))
 
 
 def mean_square_distance(first: MotionSignals, second: MotionSignals) -> float:
