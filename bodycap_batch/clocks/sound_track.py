@@ -42,7 +42,7 @@ _HIGH_PASS_HZ = 150.0
 """Frequency, Hz, below which wind and handling are removed. Origin: the correlation uses 200 Hz and above. A
 strong sound below leaks into all frequencies where a window cuts it off."""
 _FILTER_SAMPLES = RATE_HZ
-"""Number of samples that are filtered at once. Evidence: none."""
+"""Number of samples that are filtered at once. Origin: limits the memory to some megabytes."""
 _FADE_SAMPLES = RATE_HZ // 50
 """Number of samples over which a piece starts and ends: 20 ms. Origin: a sudden start would be a sound that
 all recordings have."""
@@ -388,9 +388,7 @@ class _PieceReader:
         self._separate = separate
         self._pieces: list[tuple[float, npt.NDArray[np.int16]]] = []
         self._parts: list[npt.NDArray[np.int16]] = []
-        self._waiting: list[npt.NDArray[np.int16]] = []
         self._resampler: Any = None
-        self._state: Any = None
         self._format: tuple[object, ...] = ()
         self._start_s = 0.0
         self._end_s = 0.0
@@ -410,7 +408,7 @@ class _PieceReader:
         self._count += frame.samples
         self._end_s = self._start_s + self._count / frame.sample_rate
         frame.pts = None
-        self._keep(frame)
+        self._resample(frame)
 
     def finish(self) -> list[tuple[float, npt.NDArray[np.int16]]]:
         """Return start (seconds) and samples (channels,N) of all pieces."""
@@ -426,9 +424,9 @@ class _PieceReader:
 
     def _close(self) -> None:
         if self._resampler is not None:
-            self._keep(None)
-        if self._parts:
-            samples = np.concatenate(self._parts, axis=1)
+            self._resample(None)
+        if any(part.shape[1] for part in self._parts):
+            samples = _filtered(np.concatenate(self._parts, axis=1))
             count = min(_FADE_SAMPLES, samples.shape[1] // 2)
             fade = 0.5 - 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / max(count, 1))
             samples[:, :count] = np.rint(samples[:, :count] * fade)
@@ -436,29 +434,26 @@ class _PieceReader:
                 samples[:, samples.shape[1] - count :] * fade[::-1]
             )
             self._pieces.append((self._start_s, samples))
-        self._parts, self._resampler, self._state, self._format = [], None, None, ()
+        self._parts, self._resampler, self._format = [], None, ()
 
-    def _keep(self, frame: AudioFrame | None) -> None:
-        self._waiting += [out.to_ndarray() for out in self._resampler.resample(frame)]
-        if frame is None or sum(part.shape[1] for part in self._waiting) >= _FILTER_SAMPLES:
-            self._filter()
+    def _resample(self, frame: AudioFrame | None) -> None:
+        self._parts += [out.to_ndarray() for out in self._resampler.resample(frame)]
 
-    def _filter(self) -> None:
-        """Remove the low frequencies from the samples that wait. The filter is slow for short parts."""
-        if not sum(part.shape[1] for part in self._waiting):
-            return
-        samples = np.concatenate(self._waiting, axis=1).astype(np.float64)
-        self._waiting = []
-        # Imported here, because the import takes a second and many captures have no sound.
-        from scipy.signal import sosfilt, sosfilt_zi
 
-        high_pass = _high_pass()
-        if self._state is None:
-            self._state = sosfilt_zi(high_pass)[:, None, :] * samples[:, :1]
-        # The same filter delays the sound of all cameras alike. The constant prevents tiny numbers, which are
-        # slow.
-        filtered, self._state = sosfilt(high_pass, samples + 1e-3, zi=self._state)
-        self._parts.append(np.clip(np.rint(filtered), -32768, 32767).astype(np.int16))
+def _filtered(samples: npt.NDArray[np.int16]) -> npt.NDArray[np.int16]:
+    """Return samples (channels,N) without the low frequencies."""
+    # Imported here, because the import takes a second and many captures have no sound.
+    from scipy.signal import sosfilt, sosfilt_zi
+
+    high_pass, out = _high_pass(), np.empty_like(samples)
+    state = sosfilt_zi(high_pass)[:, None, :] * samples[:, :1].astype(np.float64)
+    # The same filter delays the sound of all cameras alike. The constant prevents tiny numbers, which are
+    # slow.
+    for first in range(0, samples.shape[1], _FILTER_SAMPLES):
+        part = slice(first, first + _FILTER_SAMPLES)
+        filtered, state = sosfilt(high_pass, samples[:, part].astype(np.float64) + 1e-3, zi=state)
+        out[:, part] = np.clip(np.rint(filtered), -32768, 32767)
+    return out
 
 
 @cache
