@@ -11,8 +11,8 @@ import numpy as np
 from bodycap_batch.capture.timeline import ChapterClock, clock_of_chapter
 from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.core.arrays import IntArray
-from bodycap_batch.telemetry.gopro import gaps_of, read_gopro_file
-from bodycap_batch.telemetry.saturation import saturated_stretches
+from bodycap_batch.telemetry.gaps import gaps_of
+from bodycap_batch.telemetry.gopro import read_gopro_file
 from bodycap_batch.telemetry.streams import (
     ACCELEROMETER,
     CAMERA_ORIENTATION,
@@ -159,7 +159,7 @@ def _joined_stream(parts: Sequence[Stream]) -> Stream:
         times_s=times_s,
         values=joined,
         rate_hz=rate_hz,
-        gaps_s=(*gaps_of(times_s, rate_hz), *saturated_stretches(parts[0].key, times_s, joined)),
+        gaps_s=gaps_of(parts[0].key, times_s, joined, rate_hz),
     )
 
 
