@@ -51,6 +51,9 @@ from bodycap_batch.model.bone_axes import align_axes_with_bones
 from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.skeleton import Motion, with_file_zero_pose, with_outer_joints
 
+Steps = dict[str, list[Callable[[], list[Path]]]]
+"""The functions that write the files of each format."""
+
 LEFT_OUT = "left_out"
 """Name of the list in ``metrics.json`` with a sentence about each empty part that the files leave out."""
 
@@ -81,33 +84,30 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
     motion, gap = _exported_motion(inputs, options, left_out)
     animated = None if motion is None else apply_layout(_with_all_joints(inputs, motion, options), options)
     sigma_m = None if inputs.merge is None or motion is None else _exported_sigma_m(inputs.merge, motion)
-    steps: dict[str, Callable[[], list[Path]]] = {"tum": lambda: write_trajectories(inputs, left_out)}
+    steps: Steps = {"tum": [lambda: write_trajectories(inputs, left_out)]}
     if inputs.maps:
-        steps |= {"ply": lambda: write_maps(inputs, left_out), "colmap": lambda: write_colmap(inputs)}
-    steps["csv"] = lambda: [write_frame_table(inputs.out_dir / "frames.csv", inputs)]
+        steps |= {"ply": [lambda: write_maps(inputs, left_out)], "colmap": [lambda: write_colmap(inputs)]}
+    steps["csv"] = [lambda: [write_frame_table(inputs.out_dir / "frames.csv", inputs)]]
     if motion is not None and animated is not None:
         steps |= _motion_writers(inputs, motion, animated, options, sigma_m, left_out)
-        steps["csv"] = lambda: [
-            write_frame_table(inputs.out_dir / "frames.csv", inputs),
-            write_joint_table(inputs.out_dir / "joints.csv", motion, sigma_m),
-        ]
-    steps = {name: write for name, write in steps.items() if name in options.formats}
+        steps["csv"].append(lambda: [write_joint_table(inputs.out_dir / "joints.csv", motion, sigma_m)])
+    steps = {name: writers for name, writers in steps.items() if name in options.formats}
     _add_cameras(steps, inputs, animated, options, left_out)
     merge = inputs.merge
     if merge is not None and merge.fill is not None:
-        steps["fill"] = lambda: [write_fill_report(inputs.out_dir / FILL_FILE, merge)]
-    steps["metrics"] = lambda: [_write_metrics(inputs, motion, gap, left_out)]
+        steps["fill"] = [lambda: [write_fill_report(inputs.out_dir / FILL_FILE, merge)]]
+    steps["metrics"] = [lambda: [_write_metrics(inputs, motion, gap, left_out)]]
     written: list[Path] = []
-    for number, (name, write) in enumerate(steps.items()):
+    for number, (name, writers) in enumerate(steps.items()):
         context.check_cancelled()
         context.progress(number, len(steps), name)
-        written += write()
+        written += [path for write in writers for path in write()]
     context.progress(len(steps), len(steps), "")
     return tuple(path.relative_to(inputs.out_dir) for path in written)
 
 
 def _add_cameras(
-    steps: dict[str, Callable[[], list[Path]]],
+    steps: Steps,
     inputs: ExportInputs,
     animated: Motion | None,
     options: ExportOptions,
@@ -120,15 +120,8 @@ def _add_cameras(
         return
     writers = camera_writers(inputs.out_dir, scene)
     for name in chosen:
-        steps[name] = _both(steps.get(name), writers[name])
-    steps["cameras"] = lambda: [write_camera_facts(inputs.out_dir / CAMERA_FACTS_FILE, scene)]
-
-
-def _both(
-    first: Callable[[], list[Path]] | None, second: Callable[[], list[Path]]
-) -> Callable[[], list[Path]]:
-    """Return a function that calls both functions and returns both lists of files."""
-    return second if first is None else lambda: [*first(), *second()]
+        steps.setdefault(name, []).append(writers[name])
+    steps["cameras"] = [lambda: [write_camera_facts(inputs.out_dir / CAMERA_FACTS_FILE, scene)]]
 
 
 def _motion_writers(
@@ -138,7 +131,7 @@ def _motion_writers(
     options: ExportOptions,
     sigma_m: FloatArray | None,
     left_out: list[str],
-) -> dict[str, Callable[[], list[Path]]]:
+) -> Steps:
     """Return, for each motion format, a function that writes its file.
 
     The animation formats (BVH, GLB, FBX, USD) contain the motion in the layout that the options select. In
@@ -172,14 +165,14 @@ def _motion_writers(
         return verified(folder / "motion.usd", animated, read_usd)
 
     return {
-        "bvh": bvh,
-        "glb": glb,
-        "fbx": lambda: [write_fbx(folder / "motion.fbx", aligned, take)],
-        "usd": usd,
-        "c3d": lambda: [write_c3d(folder / "joints.c3d", centres, solved_take)],
-        "trc": trc,
-        "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m, solved_take)],
-        "blender": lambda: write_blender_files(folder, collect_blender_scene(inputs, aligned, options)),
+        "bvh": [bvh],
+        "glb": [glb],
+        "fbx": [lambda: [write_fbx(folder / "motion.fbx", aligned, take)]],
+        "usd": [usd],
+        "c3d": [lambda: [write_c3d(folder / "joints.c3d", centres, solved_take)]],
+        "trc": [trc],
+        "npz": [lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m, solved_take)]],
+        "blender": [lambda: write_blender_files(folder, collect_blender_scene(inputs, aligned, options))],
     }
 
 

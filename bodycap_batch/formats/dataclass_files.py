@@ -113,7 +113,7 @@ def _encode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911
         location.arrays[location.name] = value
         return location.name
     if hasattr(hint, "to_dict"):
-        return _json_value(value.to_dict())
+        return json_value(value.to_dict())
     if dataclasses.is_dataclass(hint):
         hints = typing.get_type_hints(hint)
         names = [field.name for field in dataclasses.fields(hint)]
@@ -130,7 +130,7 @@ def _encode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911
         return Path(value).resolve().relative_to(location.folder.resolve()).as_posix()
     if origin is float:
         return float(value) if math.isfinite(value) else str(float(value))
-    return _json_value(value)
+    return json_value(value)
 
 
 def _decode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911 - one return per kind of type
@@ -177,14 +177,14 @@ def _element_hints(hint: Any, count: int) -> tuple[Any, ...]:
     return (hints[0],) * count if len(hints) == 2 and hints[1] is Ellipsis else hints
 
 
-def _json_value(value: Any) -> Any:
+def json_value(value: Any) -> Any:
     """Convert a value without a declared type to JSON values. NaN and infinity become null."""
     if isinstance(value, Mapping):
-        return {str(key): _json_value(part) for key, part in value.items()}
+        return {str(key): json_value(part) for key, part in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_json_value(part) for part in value]
+        return [json_value(part) for part in value]
     if isinstance(value, (np.generic, np.ndarray)):
-        return _json_value(value.tolist())
+        return json_value(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if value is None or isinstance(value, (bool, int, float, str)):
