@@ -183,63 +183,53 @@ def _solve(
         (2n,) offset at the start of the sound (seconds) and drift (ppm) of each camera but the reference, its
         covariance (2n,2n), and the residuals (P,) of the offsets of the pairs, seconds.
     """
-    rows, values, weights = [], [], []
-    drift_rows, drifts, drift_weights = [], [], []
+    offsets, drifts = [], []
     for pair in pairs:
         offset, drift = np.zeros(2 * len(others)), np.zeros(2 * len(others))
-        second_s = pair.pivot_s
         for name, time_s, sign in (
-            (pair.second, second_s, 1.0),
-            (pair.first, second_s + pair.offset_s, -1.0),
+            (pair.second, pair.pivot_s, 1.0),
+            (pair.first, pair.pivot_s + pair.offset_s, -1.0),
         ):
             if name in others:
                 column = 2 * others.index(name)
                 offset[column] = sign
                 offset[column + 1] = sign * 1e-6 * (time_s - starts_s[name])
                 drift[column + 1] = sign
-        rows.append(offset)
-        values.append(pair.offset_s)
-        weights.append(1.0 / max(pair.sigma_s, _MIN_SIGMA_S))
+        offsets.append((offset, pair.offset_s, 1.0 / max(pair.sigma_s, _MIN_SIGMA_S)))
         if pair.drift_measured:
-            drift_rows.append(drift)
-            drifts.append(pair.drift_ppm)
-            drift_weights.append(1.0 / pair.drift_sigma_ppm)
-    if not rows:
+            drifts.append((drift, pair.drift_ppm, 1.0 / pair.drift_sigma_ppm))
+    if not offsets:
         return np.zeros(0), np.zeros((0, 0)), np.zeros(0)
     measured = connected_cameras(reference, [pair for pair in pairs if pair.drift_measured])
     for index, name in enumerate(others):
         if name not in measured:
-            drift_rows.append(np.eye(2 * len(others))[2 * index + 1])
-            drifts.append(0.0)
-            drift_weights.append(1.0 / CRYSTAL_SIGMA_PPM)
-    count = len(rows)
-    rows, values, weights = rows + drift_rows, values + drifts, weights + drift_weights
-    matrix, target, weight = np.array(rows), np.array(values), np.array(weights)
+            drifts.append((np.eye(2 * len(others))[2 * index + 1], 0.0, 1.0 / CRYSTAL_SIGMA_PPM))
+    matrix, target, weight = (np.array(each) for each in zip(*offsets, *drifts, strict=True))
     # The columns are scaled, because seconds and ppm have different sizes.
     scale = np.tile([1e-3, 1.0], len(others))
     weighted = matrix * weight[:, None] * scale
     inverse = np.linalg.pinv(weighted.T @ weighted)
     solution = scale * (inverse @ (weighted.T @ (target * weight)))
-    return solution, inverse * np.outer(scale, scale), (target - matrix @ solution)[:count]
+    return solution, inverse * np.outer(scale, scale), (target - matrix @ solution)[: len(offsets)]
 
 
 def _worst_pair(
     reference: str, names: Sequence[str], pairs: Sequence[Pair], starts_s: Mapping[str, float]
 ) -> Pair:
     """Return the pair without which the others agree best; of equal ones, that with the least evidence."""
-    best: tuple[float, float, Pair] | None = None
-    for pair in pairs:
-        rest = [each for each in pairs if each is not pair]
-        if len(connected_cameras(reference, rest)) < len(names):
-            continue  # the pair is in no loop
-        _, _, residuals = _solve([name for name in names if name != reference], rest, starts_s, reference)
-        left = float(np.abs(residuals).max()) if len(residuals) else 0.0
+    others = [name for name in names if name != reference]
+
+    def disagreement(pair: Pair) -> tuple[float, float]:
+        _, _, residuals = _solve(others, [each for each in pairs if each is not pair], starts_s, reference)
         # Residuals below the way of sound are equal.
-        key = (max(left, 2.0 * WAY_SIGMA_S), pair.evidence, pair)
-        if best is None or key[:2] < best[:2]:
-            best = key
-    assert best is not None, "residuals exist only in loops"
-    return best[2]
+        return max(float(np.abs(residuals).max(initial=0.0)), 2.0 * WAY_SIGMA_S), pair.evidence
+
+    in_loops = [
+        pair
+        for pair in pairs
+        if len(connected_cameras(reference, [each for each in pairs if each is not pair])) == len(names)
+    ]
+    return min(in_loops, key=disagreement)  # residuals exist only in loops
 
 
 def _closure_s(reference: str, pair: Pair, pairs: Sequence[Pair], starts_s: Mapping[str, float]) -> float:

@@ -9,6 +9,7 @@ gives them at once.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -171,12 +172,12 @@ class _LagSums:
         twice = np.where(rows == columns, 0.5, 1.0)[:, None]
         beta_hat = self._transform(beta[rows] * beta[columns] * weights)
         counts = self._counts(weights)
-        out = np.empty((3, 3, len(self.lags_s)))
-        for i in range(3):
-            for j in range(i, 3):
-                products = twice * (alpha[i, rows] * alpha[j, columns] + alpha[i, columns] * alpha[j, rows])
-                out[i, j] = out[j, i] = self._sums(self._transform(products), beta_hat) / counts
-        return out
+
+        def moment(i: int, j: int) -> FloatArray:
+            products = twice * (alpha[i, rows] * alpha[j, columns] + alpha[i, columns] * alpha[j, rows])
+            return self._sums(self._transform(products), beta_hat) / counts
+
+        return _symmetric(moment)
 
     def means(self, alpha: FloatArray, beta: FloatArray, weights: FloatArray) -> FloatArray:
         """Return weighted means (3,L) of the vectors alpha·beta; arguments as in `second_moments`."""
@@ -197,13 +198,16 @@ class _LagSums:
         weights_hat = self._transform(weights)
         counts = self._counts(weights)
         energy = self._sums(self._present_hat, self._transform((other**2).sum(axis=0) * weights)) / counts
-        out = np.empty((3, 3, len(self.lags_s)))
-        for i in range(3):
-            for j in range(i, 3):
-                own_hat = self._transform(own[i] * own[j] * self._present)
-                out[i, j] = out[j, i] = self._sums(own_hat, weights_hat) / counts
-            out[i, i] += energy / 3.0
-        return out
+        moments = _symmetric(
+            lambda i, j: self._sums(self._transform(own[i] * own[j] * self._present), weights_hat) / counts
+        )
+        return moments + np.eye(3)[:, :, None] * (energy / 3.0)
+
+
+def _symmetric(entry: Callable[[int, int], FloatArray]) -> FloatArray:
+    """Return symmetric matrices (3,3,L) whose element (i,j) is `entry(i, j)`, (L,), for i ≤ j."""
+    upper = {(i, j): entry(i, j) for i in range(3) for j in range(i, 3)}
+    return np.array([[upper[min(i, j), max(i, j)] for j in range(3)] for i in range(3)])
 
 
 def _rotated(target_from_source: FloatArray, vectors: FloatArray) -> FloatArray:
