@@ -26,10 +26,6 @@ from bodycap_batch.core.errors import StoreError
 T = TypeVar("T")
 Arrays = dict[str, np.ndarray[Any, Any]]
 
-_ZIP_DATE = (1980, 1, 1, 0, 0, 0)
-"""Date of every zip entry: the earliest date that the zip format supports. The date is constant, so that
-equal arrays give equal bytes."""
-
 
 def write_dataclass(value: Any, folder: Path, name: str) -> None:
     """Write a dataclass instance as ``<name>.json`` and, if it contains arrays, ``<name>.npz``.
@@ -74,7 +70,8 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
         for name, array in arrays.items():
             buffer = io.BytesIO()
             np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy", _ZIP_DATE), buffer.getbuffer())
+            # The date of a ZipInfo is a constant, so that equal arrays give equal bytes.
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), buffer.getbuffer())
 
 
 def read_npz(path: Path) -> Arrays:

@@ -14,8 +14,9 @@ from __future__ import annotations
 import itertools
 import re
 import struct
+from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -135,19 +136,16 @@ def _expanded_types(types: str) -> str:
     return out
 
 
-@dataclass(slots=True)
-class Damage:
+class Damage(Counter[str]):
     """The kinds of damage that were found, in the order of the first occurrence, with their numbers."""
-
-    kinds: dict[str, int] = field(default_factory=dict)
 
     def add(self, kind: str) -> None:
         """Count one occurrence of a kind of damage."""
-        self.kinds[kind] = self.kinds.get(kind, 0) + 1
+        self[kind] += 1
 
     def notes(self) -> list[str]:
         """Return one sentence for each kind of damage."""
-        return [f"{kind} ({count} times)" if count > 1 else kind for kind, count in self.kinds.items()]
+        return [f"{kind} ({count} times)" if count > 1 else kind for kind, count in self.items()]
 
 
 def read_items(data: bytes, damage: Damage) -> tuple[GpmfItem, ...]:

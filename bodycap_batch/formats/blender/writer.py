@@ -17,8 +17,6 @@ from bodycap_batch.formats.fbx.blender_process import run_script
 
 EXTENSION_FILE = "bodycap_blender.zip"
 _SCRIPT = Path(__file__).with_name("scene_script.py")
-_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
-"""Time of the files in the extension: the earliest of the ZIP format, so that equal runs give equal files."""
 
 _MANIFEST = """\
 schema_version = "1.0.0"
@@ -61,7 +59,8 @@ def _extension(script: str) -> bytes:
     manifest = _MANIFEST.format(version=bodycap_batch.__version__)
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, text in (("blender_manifest.toml", manifest), ("__init__.py", script)):
-            archive.writestr(zipfile.ZipInfo(name, _ZIP_TIME), text, zipfile.ZIP_DEFLATED)
+            # The time of a ZipInfo is a constant, so that equal runs give equal files.
+            archive.writestr(zipfile.ZipInfo(name), text, zipfile.ZIP_DEFLATED)
     return stream.getvalue()
 
 
