@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, frozen_array
+from bodycap_batch.model.animated_camera import AnimatedCamera
+from bodycap_batch.model.geometry import make_transform
 
 Y_UP_FROM_WORLD: FloatArray = frozen_array(
     [[1, 0, 0], [0, 0, 1], [0, -1, 0]], name="y_up_from_world", shape=(3, 3)
@@ -17,3 +19,13 @@ WORLD_FROM_Y_UP: FloatArray = Y_UP_FROM_WORLD.T
 def in_other_axes(target_from_source: FloatArray, rotation: FloatArray) -> FloatArray:
     """Convert rotations (...,3,3) between two frames from source axes (3,3) to target axes, on both sides."""
     return np.asarray(target_from_source @ rotation @ target_from_source.T)
+
+
+def camera_poses_with_y_up(camera: AnimatedCamera) -> FloatArray:
+    """Return the poses (T,4,4) of the axes of a camera in computer graphics, in a scene with Y up."""
+    return make_transform(Y_UP_FROM_WORLD, np.zeros(3)) @ camera.scene_from_gl()
+
+
+def poses_from_y_up(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """Return the world poses (N,4,4) of rotations (N,3,3) and translations (N,3) in a scene with Y up."""
+    return make_transform(WORLD_FROM_Y_UP @ rotation, translation @ Y_UP_FROM_WORLD)

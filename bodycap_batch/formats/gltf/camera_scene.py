@@ -5,16 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.gltf.binary_buffer import ARRAY_BUFFER, BinaryBuffer, read_accessor
 from bodycap_batch.formats.palette import linear_colours
-from bodycap_batch.formats.y_up import WORLD_FROM_Y_UP, Y_UP_FROM_WORLD
+from bodycap_batch.formats.y_up import Y_UP_FROM_WORLD, camera_poses_with_y_up, poses_from_y_up
 from bodycap_batch.model.animated_camera import NEAR_PLANE, AnimatedCamera, CameraScene
 from bodycap_batch.model.geometry import (
     continuous_quat_xyzw,
-    make_transform,
     quat_xyzw_from_rotation,
     rotation_from_quat_xyzw,
 )
@@ -79,16 +76,11 @@ def write_camera_glb(path: Path, scene: CameraScene) -> Path:
     return path
 
 
-def _poses_in_file(camera: AnimatedCamera) -> FloatArray:
-    """Return the poses (T,4,4) of a camera in the axes of the file."""
-    return make_transform(Y_UP_FROM_WORLD, np.zeros(3)) @ camera.scene_from_gl()
-
-
 def _camera_node(camera: AnimatedCamera, index: int) -> Any:
     """Return the node of a camera, with its pose at the first frame."""
     import pygltflib as gl
 
-    first = _poses_in_file(camera)[0]
+    first = camera_poses_with_y_up(camera)[0]
     return gl.Node(
         name=camera.name,
         camera=index,
@@ -102,7 +94,7 @@ def _camera_animation(scene: CameraScene, buffer: BinaryBuffer) -> Any:
     """Return the animation of all cameras."""
     curves = []
     for node, camera in enumerate(scene.cameras):
-        poses = _poses_in_file(camera)
+        poses = camera_poses_with_y_up(camera)
         curves.append((node, "rotation", continuous_quat_xyzw(poses[:, :3, :3])))
         curves.append((node, "translation", poses[:, :3, 3]))
     return buffer.animation(scene.take.name or "Cameras", scene.take.fps, curves)
@@ -127,9 +119,6 @@ def read_camera_glb(path: Path) -> dict[str, tuple[float, FloatArray]]:
     out = {}
     for number, curves in found.items():
         node = document.nodes[number]
-        poses = make_transform(
-            WORLD_FROM_Y_UP @ rotation_from_quat_xyzw(curves["rotation"]),
-            curves["translation"] @ Y_UP_FROM_WORLD,
-        )
+        poses = poses_from_y_up(rotation_from_quat_xyzw(curves["rotation"]), curves["translation"])
         out[node.name] = (float(document.cameras[node.camera].perspective.yfov), poses)
     return out
