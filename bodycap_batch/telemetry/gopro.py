@@ -25,7 +25,6 @@ from bodycap_batch.formats.gpmf import (
     gopro_stabilisation,
     read_items,
 )
-from bodycap_batch.telemetry.gaps import gaps_of
 from bodycap_batch.telemetry.stream_clock import MAX_SAMPLES, Payload, StreamClock, fit_stream_clock
 from bodycap_batch.telemetry.streams import (
     ACCELEROMETER,
@@ -39,6 +38,7 @@ from bodycap_batch.telemetry.streams import (
     CameraTelemetry,
     GpsTrack,
     Stream,
+    gaps_of,
 )
 
 _STREAMS = {

@@ -21,8 +21,14 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.core.text_encoding import decode_text
-from bodycap_batch.telemetry.gaps import gaps_of
-from bodycap_batch.telemetry.streams import ACCELEROMETER, GYROSCOPE, CameraTelemetry, Stream, TelemetrySource
+from bodycap_batch.telemetry.streams import (
+    ACCELEROMETER,
+    GYROSCOPE,
+    CameraTelemetry,
+    Stream,
+    TelemetrySource,
+    gaps_of,
+)
 
 _TIME_UNITS_S = {"t": 1.0, "time": 1.0, "t_s": 1.0, "t_ms": 1e-3, "t_us": 1e-6, "t_ns": 1e-9}
 """Unit, seconds, of the first column, by its name. In a Gyroflow file, ``tscale`` gives it."""
