@@ -83,7 +83,8 @@ class BinaryBuffer:
         import pygltflib as gl
 
         times = self.add(np.arange(len(curves[0][2])) / fps, "SCALAR")
-        samplers, channels = [], []
+        samplers: list[Any] = []
+        channels: list[Any] = []
         for node, path, values in curves:
             output = self.add(values, f"VEC{values.shape[1]}")
             target = gl.AnimationChannelTarget(node=node, path=path)
