@@ -18,8 +18,7 @@ from bodycap_batch.clocks.container_times import (
 from bodycap_batch.clocks.joint_offsets import MAX_DRIFT_PPM, camera_pairs, connected_cameras
 from bodycap_batch.clocks.pair_offsets import PairOffset, measure_channels
 from bodycap_batch.clocks.phase_correlation import PEAK_WIDTH_S
-from bodycap_batch.clocks.recorders import Recorder
-from bodycap_batch.clocks.sound_track import SoundTrack, read_channels, read_sound_track
+from bodycap_batch.clocks.sound_track import Recorder, SoundTrack, read_channels, read_sound_track
 from bodycap_batch.config.models import CameraConfig, CaptureConfig
 
 

@@ -7,6 +7,7 @@ it may belong to another microphone. Then each channel of each stream is read as
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -18,11 +19,11 @@ import numpy.typing as npt
 
 from bodycap_batch.capture.timeline import ChapterClock, clock_of_chapter
 from bodycap_batch.capture.video import VideoFile, error_reason, open_container
-from bodycap_batch.clocks.recorders import Recorder, recorder_of
 from bodycap_batch.core.arrays import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from av.audio.frame import AudioFrame
+    from av.audio.stream import AudioStream
     from av.container import InputContainer
 
 RATE_HZ = 16_000
@@ -71,7 +72,42 @@ _LINE_WIDTH_HZ = 41
 _MAX_HUM = 0.8
 """Maximum share of the power of a track in such lines. Evidence: docs/decisions/clocks.md."""
 
+_MODEL_KEYS = (
+    "com.apple.quicktime.model",
+    "com.android.model",
+    "model",
+    "com.apple.quicktime.make",
+    "com.android.manufacturer",
+    "make",
+)
+"""Keys of container metadata that name the model of a camera or its maker."""
+
 Samples = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recorder:
+    """What a file says about the device and the encoder of its sound.
+
+    Attributes:
+        model: Name of the camera model; empty if it is unknown.
+        encoder: Container, codec and handlers. Equal cameras write equal values.
+        rate_hz: Samples per second of the sound.
+    """
+
+    model: str
+    encoder: tuple[str, ...]
+    rate_hz: int
+
+    def is_like(self, other: Recorder) -> bool:
+        """Return True if both files seem to come from cameras of the same model.
+
+        Cameras of different models relate sound and picture differently. If a model is unknown, cameras with
+        a difference of encoder or format are treated as different models.
+        """
+        if self.model and other.model:
+            return self.model == other.model
+        return (self.model, self.encoder, self.rate_hz) == (other.model, other.encoder, other.rate_hz)
 
 
 @dataclass(frozen=True, slots=True)
@@ -348,6 +384,25 @@ def _read_file(
                     problem="" if pieces else broken or "its sound track is empty",
                     notes=(*([gaps] if len(pieces) > 1 else []), *([broken] if pieces and broken else [])),
                 )
+
+
+def recorder_of(container: InputContainer, stream: AudioStream) -> Recorder:
+    """Read what an opened file says about the device and the encoder of its sound."""
+    metadata = {key.lower(): value for key, value in container.metadata.items()}
+    model = " ".join(metadata[key] for key in _MODEL_KEYS if metadata.get(key))
+    # The first part of a GoPro's firmware version names the camera: HD5.02, H19.03.
+    firmware = re.match(r"^(H[A-Z]?\d+)\.", metadata.get("firmware", ""))
+    if not model and firmware:
+        model = firmware.group(1)
+    encoder = (
+        container.format.name,
+        metadata.get("major_brand", ""),
+        metadata.get("encoder", ""),
+        stream.codec_context.name,
+        str(stream.metadata.get("handler_name", "")).strip(),
+        str(stream.codec_context.layout.name),
+    )
+    return Recorder(model=model, encoder=encoder, rate_hz=int(stream.codec_context.sample_rate or 0))
 
 
 def _decode(container: InputContainer, readers: Mapping[int, _PieceReader]) -> str:

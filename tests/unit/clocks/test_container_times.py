@@ -12,7 +12,7 @@ from bodycap_batch.clocks.container_times import (
     timecode_seconds,
 )
 from bodycap_batch.clocks.reasons import duration_text
-from bodycap_batch.clocks.recorders import Recorder
+from bodycap_batch.clocks.sound_track import Recorder
 from tests.gpmf import Sensor, item, nested, payloads, write_gopro
 from tests.videos import textured_frame
 
