@@ -10,10 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.export.blender_scene import collect_blender_scene
 from bodycap_batch.export.camera_animation import collect_camera_scene
@@ -26,8 +23,6 @@ from bodycap_batch.export.camera_files import (
 from bodycap_batch.export.earth import earth_of_world
 from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.fill_report import FILL_FILE, write_fill_report
-from bodycap_batch.export.frame_table import write_frame_table
-from bodycap_batch.export.joint_tables import write_joint_arrays, write_joint_table
 from bodycap_batch.export.layout import added_root, apply_layout
 from bodycap_batch.export.metrics import collect_metrics
 from bodycap_batch.export.motion_files import (
@@ -37,6 +32,7 @@ from bodycap_batch.export.motion_files import (
     without_unsolved_branches,
 )
 from bodycap_batch.export.scene_files import write_colmap, write_maps, write_trajectories
+from bodycap_batch.export.tables import write_frame_table, write_joint_arrays, write_joint_table
 from bodycap_batch.export.take_time import take_of_motion
 from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.formats.blender import write_blender_files
@@ -83,17 +79,17 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
     left_out: list[str] = []
     motion, gap = _exported_motion(inputs, options, left_out)
     animated = None if motion is None else apply_layout(_with_all_joints(inputs, motion, options), options)
-    sigma_m = None if inputs.merge is None or motion is None else _exported_sigma_m(inputs.merge, motion)
     steps: Steps = {"tum": [lambda: write_trajectories(inputs, left_out)]}
     if inputs.maps:
         steps |= {"ply": [lambda: write_maps(inputs, left_out)], "colmap": [lambda: write_colmap(inputs)]}
     steps["csv"] = [lambda: [write_frame_table(inputs.out_dir / "frames.csv", inputs)]]
-    if motion is not None and animated is not None:
-        steps |= _motion_writers(inputs, motion, animated, options, sigma_m, left_out)
-        steps["csv"].append(lambda: [write_joint_table(inputs.out_dir / "joints.csv", motion, sigma_m)])
+    merge = inputs.merge
+    if merge is not None and motion is not None and animated is not None:
+        of_motion = _motion_writers(inputs, merge, motion, animated, options, left_out)
+        steps["csv"] += of_motion.pop("csv")
+        steps |= of_motion
     steps = {name: writers for name, writers in steps.items() if name in options.formats}
     _add_cameras(steps, inputs, animated, options, left_out)
-    merge = inputs.merge
     if merge is not None and merge.fill is not None:
         steps["fill"] = [lambda: [write_fill_report(inputs.out_dir / FILL_FILE, merge)]]
     steps["metrics"] = [lambda: [_write_metrics(inputs, motion, gap, left_out)]]
@@ -126,10 +122,10 @@ def _add_cameras(
 
 def _motion_writers(
     inputs: ExportInputs,
+    merge: MergeResult,
     motion: Motion,
     animated: Motion,
     options: ExportOptions,
-    sigma_m: FloatArray | None,
     left_out: list[str],
 ) -> Steps:
     """Return, for each motion format, a function that writes its file.
@@ -138,10 +134,11 @@ def _motion_writers(
     GLB and FBX files, the joints' axes follow the bones, because programs draw bones along these axes. The
     measurement formats (C3D, TRC, NPZ) contain the solved motion.
     """
-    folder, measured = inputs.out_dir, _measured_joints(inputs, motion)
+    kept = [merge.skeleton.joints.index(name) for name in motion.skeleton.joints]
+    folder, measured, sigma_m = inputs.out_dir, merge.solved[kept], merge.joint_sigma_m()[:, kept]
     take, solved_take = take_of_motion(inputs, animated), take_of_motion(inputs, motion)
     centres = points_from_motion(motion, measured, sigma_m)
-    sigma = None if sigma_m is None else sigma_in_layout(motion, animated, sigma_m)
+    sigma = sigma_in_layout(motion, animated, sigma_m)
     aligned, place = align_axes_with_bones(animated), earth_of_world(inputs)
     earth = None if place is None else place.figures()
     markers = points_from_motion(motion, None if options.filled_markers else measured)
@@ -165,6 +162,7 @@ def _motion_writers(
         return verified(folder / "motion.usd", animated, read_usd)
 
     return {
+        "csv": [lambda: [write_joint_table(folder / "joints.csv", motion, sigma_m)]],
         "bvh": [bvh],
         "glb": [glb],
         "fbx": [lambda: [write_fbx(folder / "motion.fbx", aligned, take)]],
@@ -185,20 +183,6 @@ def _with_all_joints(inputs: ExportInputs, motion: Motion, options: ExportOption
     if merge is None or motion.skeleton.joints != merge.skeleton.joints or added_root(motion, options):
         return motion
     return with_file_zero_pose(with_outer_joints(merge.motion))
-
-
-def _measured_joints(inputs: ExportInputs, motion: Motion) -> BoolArray | None:
-    """Return (J,) which exported joints were measured; None without a body."""
-    if inputs.merge is None:
-        return None
-    kept = [inputs.merge.skeleton.joints.index(name) for name in motion.skeleton.joints]
-    return np.asarray(inputs.merge.solved[kept])
-
-
-def _exported_sigma_m(merge: MergeResult, motion: Motion) -> FloatArray:
-    """Return the standard deviation (T,J) of each exported joint's centre, metres; NaN if not solved."""
-    kept = [merge.skeleton.joints.index(name) for name in motion.skeleton.joints]
-    return merge.joint_sigma_m()[:, kept]
 
 
 def _write_metrics(
