@@ -12,7 +12,7 @@ from scipy.signal import butter, sosfilt
 
 from bodycap_batch.clocks.sound_track import RATE_HZ, SoundPiece, SoundTrack
 from bodycap_batch.formats.file_url import file_url
-from bodycap_batch.formats.sound_frames import sound_frames
+from bodycap_batch.formats.mp4_writer import sound_frames
 from bodycap_batch.synthetic.sound import Microphone, Samples, Scene, make_scene, record
 from tests.videos import textured_frame
 

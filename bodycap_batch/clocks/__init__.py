@@ -1,26 +1,23 @@
 """The clocks of the cameras: offsets and drifts between them, from their sound and from their motion."""
 
-from bodycap_batch.clocks.capture_clocks import (
+from bodycap_batch.clocks.capture_clocks import decide_clocks, with_known_offsets
+from bodycap_batch.clocks.descriptions import (
     clock_notes,
     clocks_from_motion_notes,
-    decide_clocks,
     describe_clock,
     describe_clocks,
-    with_known_offsets,
 )
 from bodycap_batch.clocks.estimate import (
     ClockEstimate,
     ClockEstimates,
-    SoundEvidence,
     combine_evidence,
     estimate_clocks,
-    measure_sound,
     stated_offsets,
 )
 from bodycap_batch.clocks.motion_evidence import add_motion
-from bodycap_batch.clocks.motion_offsets import motion_clocks
+from bodycap_batch.clocks.motion_offsets import clocks_from_paths, motion_clocks
 from bodycap_batch.clocks.motion_signals import CameraPath
-from bodycap_batch.clocks.registered_paths import clocks_from_paths
+from bodycap_batch.clocks.sound_evidence import SoundEvidence, measure_sound
 
 __all__ = [
     "CameraPath",

@@ -23,7 +23,7 @@ _CREATION_RESOLUTION_S = 1.0
 """Resolution of a creation time, seconds. Origin: the format of the container."""
 _RANGE_SIGMAS = 4.0
 """Number of standard deviations of the offset that are searched first. Evidence: none."""
-_DAY_S = 86_400.0
+DAY_S = 86_400.0
 """Seconds of a day."""
 _APART_S = 6 * 3600.0
 """Difference, seconds, from which two recordings are reported as of different dates. Origin: longer than a
@@ -65,6 +65,10 @@ class ExpectedOffset:
         """Return the least and the greatest offset to search first, seconds."""
         reach = _RANGE_SIGMAS * self.sigma_s
         return self.offset_s - reach, self.offset_s + reach
+
+    def are_dates_apart(self) -> bool:
+        """Return True if two recordings are of different dates according to their files."""
+        return abs(self.offset_s) > _APART_S
 
     def contradicts(self, offset_s: float) -> bool:
         """Return True if a measured offset is outside the limits."""
@@ -139,31 +143,6 @@ def expected_offset(first: ContainerTime, second: ContainerTime) -> ExpectedOffs
         return created
     between = second.timecode_s - first.timecode_s
     if created is None:
-        between = (between + 0.5 * _DAY_S) % _DAY_S - 0.5 * _DAY_S
+        between = (between + 0.5 * DAY_S) % DAY_S - 0.5 * DAY_S
     coded = ExpectedOffset(between + frames, CLOCK_SIGMA_S + max(first.frame_s, second.frame_s))
     return coded if created is None or not created.contradicts(coded.offset_s) else created
-
-
-def describe_difference(first: str, second: str, difference_s: float) -> str:
-    """Return a sentence about two recordings whose files give other times than their sound.
-
-    Args:
-        first: Name of the first camera.
-        second: Name of the second camera.
-        difference_s: Offset according to the files − offset according to the sound, or, without sound, the
-            time between the recordings, seconds.
-    """
-    return f"the files of {first} and {second} give times that are {duration_text(difference_s)} apart"
-
-
-def are_dates_apart(expected: ExpectedOffset) -> bool:
-    """Return True if two recordings are of different dates according to their files."""
-    return abs(expected.offset_s) > _APART_S
-
-
-def duration_text(seconds: float) -> str:
-    """Return a duration as text: days, hours or seconds."""
-    size = abs(seconds)
-    if size >= _DAY_S:
-        return f"{size / _DAY_S:.1f} days"
-    return f"{size / 3600:.1f} hours" if size >= 3600.0 else f"{size:.1f} s"

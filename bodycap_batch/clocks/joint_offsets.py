@@ -14,9 +14,15 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from bodycap_batch.clocks.clock_pair import CRYSTAL_SIGMA_PPM, ClockPair
 from bodycap_batch.core.arrays import FloatArray
 
+CRYSTAL_SIGMA_PPM = 40.0
+"""Standard deviation of the drift between two clocks, ppm, if it was not measured. Origin: crystals have a
+tolerance of ±50 ppm, about 29 ppm of standard deviation each."""
+MAX_DRIFT_PPM = 150.0
+"""Maximum drift, ppm. Origin: twice the tolerance of crystals, with some room for cold and heat."""
+MAX_SIGMAS = 3.0
+"""Maximum difference of two offsets of a camera that do not contradict each other, in standard deviations."""
 WAY_SIGMA_S = 0.0015
 """Standard deviation, seconds, of an offset due to the way of sound. Origin: the ways from a source to two
 cameras on a body differ by up to 1 m, which is 3 ms."""
@@ -27,6 +33,40 @@ _MIN_SIGMA_S = 1e-4
 """Least standard deviation of the offset of a pair, seconds, so that no pair has an infinite weight."""
 _MAX_CLOSURE_SIGMAS = 4.0
 """Maximum residual of a pair in a loop, in its standard deviations. Evidence: none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockPair:
+    """What a measurement says about the clocks of two cameras.
+
+    Time of the first camera = time of the second camera + `offset_s` at the time `pivot_s` of the second
+    camera. From there the difference changes by `drift_ppm`.
+
+    Attributes:
+        first: Name of the first camera.
+        second: Name of the second camera.
+        accepted: True if the offset is determined.
+        reason: Why the pair was not accepted; empty if it was.
+        pivot_s: Time on the second camera's clock, seconds, at which offset and drift are not correlated.
+        offset_s: Difference of the clocks at the pivot, seconds.
+        sigma_s: Standard deviation of the offset, seconds.
+        drift_ppm: Drift, parts per million; 0 if it was not measured.
+        drift_sigma_ppm: Standard deviation of the drift.
+        drift_measured: True if the drift was measured.
+        evidence: How clear the offset is; each measurement has its own scale.
+    """
+
+    first: str
+    second: str
+    accepted: bool = False
+    reason: str = ""
+    pivot_s: float = 0.0
+    offset_s: float = 0.0
+    sigma_s: float = float("inf")
+    drift_ppm: float = 0.0
+    drift_sigma_ppm: float = CRYSTAL_SIGMA_PPM
+    drift_measured: bool = False
+    evidence: float = 0.0
 
 
 Pair = TypeVar("Pair", bound=ClockPair)
@@ -81,7 +121,7 @@ def solve_clocks(
     reference: str,
     pairs: Sequence[Pair],
     starts_s: Mapping[str, float],
-    floors_s: Mapping[str, float] | None = None,
+    floors_s: Mapping[str, float],
 ) -> JointClocks[Pair]:
     """Solve the clocks of all cameras from accepted pairs.
 
@@ -90,7 +130,7 @@ def solve_clocks(
         pairs: The accepted pairs.
         starts_s: Start of the sound of each camera on its own clock, seconds.
         floors_s: Standard deviation, seconds, of the offset of each camera that more sound does not reduce:
-            `WAY_SIGMA_S` or `UNLIKE_SIGMA_S`. Default: `WAY_SIGMA_S`.
+            `WAY_SIGMA_S` or `UNLIKE_SIGMA_S`, or that of the motion.
     """
     used = list(pairs)
     dropped: list[tuple[Pair, float]] = []
@@ -114,11 +154,10 @@ def solve_clocks(
         shift = np.array([[1.0, -1e-6 * starts_s[name]], [0.0, 1.0]])
         own = covariance[2 * index : 2 * index + 2, 2 * index : 2 * index + 2]
         offset_s, drift_ppm = shift @ solution[2 * index : 2 * index + 2]
-        floor = WAY_SIGMA_S if floors_s is None else floors_s[name]
         clocks[name] = JointClock(
             offset_s=float(offset_s),
             drift_ppm=float(drift_ppm),
-            covariance=shift @ own @ shift.T + np.diag([floor**2, 0.0]),
+            covariance=shift @ own @ shift.T + np.diag([floors_s[name] ** 2, 0.0]),
             drift_measured=name in measured,
         )
     return JointClocks(clocks=clocks, dropped=tuple(dropped))
@@ -144,63 +183,53 @@ def _solve(
         (2n,) offset at the start of the sound (seconds) and drift (ppm) of each camera but the reference, its
         covariance (2n,2n), and the residuals (P,) of the offsets of the pairs, seconds.
     """
-    rows, values, weights = [], [], []
-    drift_rows, drifts, drift_weights = [], [], []
+    offsets, drifts = [], []
     for pair in pairs:
         offset, drift = np.zeros(2 * len(others)), np.zeros(2 * len(others))
-        second_s = pair.pivot_s
         for name, time_s, sign in (
-            (pair.second, second_s, 1.0),
-            (pair.first, second_s + pair.offset_s, -1.0),
+            (pair.second, pair.pivot_s, 1.0),
+            (pair.first, pair.pivot_s + pair.offset_s, -1.0),
         ):
             if name in others:
                 column = 2 * others.index(name)
                 offset[column] = sign
                 offset[column + 1] = sign * 1e-6 * (time_s - starts_s[name])
                 drift[column + 1] = sign
-        rows.append(offset)
-        values.append(pair.offset_s)
-        weights.append(1.0 / max(pair.sigma_s, _MIN_SIGMA_S))
+        offsets.append((offset, pair.offset_s, 1.0 / max(pair.sigma_s, _MIN_SIGMA_S)))
         if pair.drift_measured:
-            drift_rows.append(drift)
-            drifts.append(pair.drift_ppm)
-            drift_weights.append(1.0 / pair.drift_sigma_ppm)
-    if not rows:
+            drifts.append((drift, pair.drift_ppm, 1.0 / pair.drift_sigma_ppm))
+    if not offsets:
         return np.zeros(0), np.zeros((0, 0)), np.zeros(0)
     measured = connected_cameras(reference, [pair for pair in pairs if pair.drift_measured])
     for index, name in enumerate(others):
         if name not in measured:
-            drift_rows.append(np.eye(2 * len(others))[2 * index + 1])
-            drifts.append(0.0)
-            drift_weights.append(1.0 / CRYSTAL_SIGMA_PPM)
-    count = len(rows)
-    rows, values, weights = rows + drift_rows, values + drifts, weights + drift_weights
-    matrix, target, weight = np.array(rows), np.array(values), np.array(weights)
+            drifts.append((np.eye(2 * len(others))[2 * index + 1], 0.0, 1.0 / CRYSTAL_SIGMA_PPM))
+    matrix, target, weight = (np.array(each) for each in zip(*offsets, *drifts, strict=True))
     # The columns are scaled, because seconds and ppm have different sizes.
     scale = np.tile([1e-3, 1.0], len(others))
     weighted = matrix * weight[:, None] * scale
     inverse = np.linalg.pinv(weighted.T @ weighted)
     solution = scale * (inverse @ (weighted.T @ (target * weight)))
-    return solution, inverse * np.outer(scale, scale), (target - matrix @ solution)[:count]
+    return solution, inverse * np.outer(scale, scale), (target - matrix @ solution)[: len(offsets)]
 
 
 def _worst_pair(
     reference: str, names: Sequence[str], pairs: Sequence[Pair], starts_s: Mapping[str, float]
 ) -> Pair:
     """Return the pair without which the others agree best; of equal ones, that with the least evidence."""
-    best: tuple[float, float, Pair] | None = None
-    for pair in pairs:
-        rest = [each for each in pairs if each is not pair]
-        if len(connected_cameras(reference, rest)) < len(names):
-            continue  # the pair is in no loop
-        _, _, residuals = _solve([name for name in names if name != reference], rest, starts_s, reference)
-        left = float(np.abs(residuals).max()) if len(residuals) else 0.0
+    others = [name for name in names if name != reference]
+
+    def disagreement(pair: Pair) -> tuple[float, float]:
+        _, _, residuals = _solve(others, [each for each in pairs if each is not pair], starts_s, reference)
         # Residuals below the way of sound are equal.
-        key = (max(left, 2.0 * WAY_SIGMA_S), pair.evidence, pair)
-        if best is None or key[:2] < best[:2]:
-            best = key
-    assert best is not None, "residuals exist only in loops"
-    return best[2]
+        return max(float(np.abs(residuals).max(initial=0.0)), 2.0 * WAY_SIGMA_S), pair.evidence
+
+    in_loops = [
+        pair
+        for pair in pairs
+        if len(connected_cameras(reference, [each for each in pairs if each is not pair])) == len(names)
+    ]
+    return min(in_loops, key=disagreement)  # residuals exist only in loops
 
 
 def _closure_s(reference: str, pair: Pair, pairs: Sequence[Pair], starts_s: Mapping[str, float]) -> float:

@@ -7,14 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodycap_batch.clocks.clock_pair import CRYSTAL_SIGMA_PPM
-from bodycap_batch.clocks.estimate import ClockEstimate, ClockEstimates, Recording, SoundEvidence
-from bodycap_batch.clocks.joint_offsets import WAY_SIGMA_S, JointClock
+from bodycap_batch.clocks.estimate import ClockEstimate, ClockEstimates
+from bodycap_batch.clocks.joint_offsets import CRYSTAL_SIGMA_PPM, MAX_SIGMAS, WAY_SIGMA_S, JointClock
 from bodycap_batch.clocks.motion_offsets import MotionClocks
 from bodycap_batch.clocks.pair_offsets import PairOffset
+from bodycap_batch.clocks.sound_evidence import Recording, SoundEvidence
 
-_MAX_SIGMAS = 3.0
-"""Maximum difference of sound and motion, in standard deviations."""
 _MAX_DIFFERENCE_S = 1.0 / 30.0
 """Difference, seconds, of sound and motion that is no contradiction. Origin: one frame at 30 fps."""
 _MIN_SCORE_DROP = 5.0
@@ -50,7 +48,7 @@ def add_motion(
         evidence: What the sound says, with the numbers of frames of the videos.
         stated_s: Stated offset of each camera relative to the reference camera, seconds, by camera name.
     """
-    recordings = {recording.camera: recording for recording in evidence.recordings}
+    recordings = evidence.by_camera()
     found = {}
     for estimate in estimates.cameras:
         clock = motion.clocks.get(estimate.camera)
@@ -78,7 +76,7 @@ def _compared(estimate: ClockEstimate, clock: JointClock | None) -> ClockEstimat
         return estimate
     difference_s = clock.offset_s - estimate.offset_s
     sigma_s = float(np.hypot(clock.sigma_s, estimate.sigma_s))
-    if abs(difference_s) > max(_MAX_SIGMAS * sigma_s, _MAX_DIFFERENCE_S):
+    if abs(difference_s) > max(MAX_SIGMAS * sigma_s, _MAX_DIFFERENCE_S):
         text = (
             f"the motion gives an offset of {clock.offset_s:.3f} ± {clock.sigma_s:.3f} s, but the "
             f"sound gives {estimate.offset_s:.3f} ± {estimate.sigma_s:.3f} s"
@@ -132,15 +130,7 @@ def _from_motion(
     estimate: ClockEstimate, clock: JointClock, reference: Recording | None, recording: Recording | None
 ) -> ClockEstimate:
     """Return the clock from the motion, or a common start if that is much more probable."""
-    found = replace(
-        estimate,
-        offset_s=clock.offset_s,
-        sigma_s=clock.sigma_s,
-        drift_ppm=clock.drift_ppm if clock.drift_measured else 0.0,
-        drift_sigma_ppm=clock.drift_sigma_ppm,
-        source="motion",
-        covariance=clock.covariance,
-    )
+    found = estimate.solved(clock, "motion")
     if reference is None or recording is None or clock.drift_measured:
         return found
     start_s = reference.first_frame_s - recording.first_frame_s

@@ -14,8 +14,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bodycap_batch.clocks.clock_pair import CRYSTAL_SIGMA_PPM, ClockPair
-from bodycap_batch.clocks.joint_offsets import JointClock, JointClocks, solve_clocks
+from bodycap_batch.clocks.joint_offsets import (
+    CRYSTAL_SIGMA_PPM,
+    MAX_DRIFT_PPM,
+    ClockPair,
+    JointClock,
+    JointClocks,
+    solve_clocks,
+)
 from bodycap_batch.clocks.motion_score import (
     LIMB_WEIGHTS_HZ,
     TRUNK_WEIGHTS_HZ,
@@ -24,6 +30,7 @@ from bodycap_batch.clocks.motion_score import (
 )
 from bodycap_batch.clocks.motion_signals import STEP_S, CameraPath, MotionSignals, motion_signals
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.scene import Trajectory
 
 MIN_COMMON_S = 2.0
 """Least time in which both cameras were localised, seconds. Evidence: none."""
@@ -63,8 +70,6 @@ _WINDOW_S = 20.0
 """Duration of the windows from which the drift is measured, seconds. Evidence: none."""
 _WINDOW_REACH_S = 0.3
 """Maximum difference, seconds, of the offset of a window from that of the whole recording."""
-_MAX_DRIFT_PPM = 150.0
-"""Maximum drift, ppm. Origin: twice the tolerance of crystals, with some room for cold and heat."""
 _MAX_PAIR_SIGMA_S = 0.1
 """Maximum width, seconds, of the peak of a pair that is used in the common solution. A wider peak contains no
 information within `_NEAR_S`."""
@@ -286,7 +291,7 @@ def _fit_drift(
     likelihood = np.exp(curves - curves.max(axis=1)[:, None]) @ spread
     curves = np.log(likelihood + 1e-12)
     pivot_s = float(times_s.mean())
-    slopes = np.arange(-_MAX_DRIFT_PPM, _MAX_DRIFT_PPM + 1e-9, 2.0)
+    slopes = np.arange(-MAX_DRIFT_PPM, MAX_DRIFT_PPM + 1e-9, 2.0)
     centres = grid[np.abs(grid) <= 0.5 * _WINDOW_REACH_S]
     total = np.zeros((len(slopes), len(centres)))
     for time_s, curve in zip(times_s.tolist(), curves, strict=True):
@@ -388,3 +393,30 @@ def _peak_of(name: str, offsets_s: Mapping[str, float], curves: Sequence[MotionC
     grid = np.arange(np.min(ends), np.max(ends) + _GRID_S, _GRID_S)
     total = sum((curve.at(sign * (grid - known_s)) for curve, known_s, sign in terms), np.zeros(len(grid)))
     return _find_peak(grid, total, _GRID_S, min(curve.limb_lag_s for curve, _, _ in terms))
+
+
+def clocks_from_paths(
+    trajectories: Sequence[Trajectory], roles: Mapping[str, str], reference: str
+) -> MotionClocks:
+    """Measure the clocks of cameras from their registered trajectories.
+
+    Args:
+        trajectories: The trajectory of each camera, on its own clock.
+        roles: Role of the bone that each camera is mounted on, by camera name; "" if it is unknown.
+        reference: Name of the reference camera. Cameras in other maps have no clock.
+    """
+    gauges = {path.camera: path.gauge for path in trajectories}
+    same_map = [path for path in trajectories if path.gauge == gauges.get(reference)]
+    paths = [
+        CameraPath(
+            camera=path.camera,
+            role=roles.get(path.camera, ""),
+            times_ns=path.times_ns[path.localised],
+            map_from_cam=path.gauge_from_cam[path.localised],
+        )
+        for path in same_map
+    ]
+    found = motion_clocks(paths, reference)
+    others = {name for name, gauge in gauges.items() if gauge != gauges.get(reference)}
+    separate = dict.fromkeys(others, f"its map has no place in common with that of {reference}")
+    return replace(found, reasons={**found.reasons, **separate})

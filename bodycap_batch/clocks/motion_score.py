@@ -9,6 +9,7 @@ gives them at once.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,13 +36,11 @@ class MotionScore:
     Attributes:
         lags_s: (L,) offsets: time of the first camera − time of the second, seconds.
         common_s: (L,) time in which both cameras were localised, seconds.
-        parts: (P,L) parts of the logarithm of the likelihood for one independent sample per second.
         score: (L,) logarithm of the likelihood, relative to that of a typical offset.
     """
 
     lags_s: FloatArray
     common_s: FloatArray
-    parts: FloatArray
     score: FloatArray
 
 
@@ -66,7 +65,7 @@ def motion_score(
     """
     sums = _LagSums(first, second, min_common_s, limits_s)
     if not sums.chosen.any():
-        return MotionScore(np.zeros(0), np.zeros(0), np.zeros((len(weights_hz), 0)), np.zeros(0))
+        return MotionScore(*np.zeros((3, 0)))
     cam_from_map = first.map_from_cam.transpose(1, 0, 2)
     middle = (first.position * first.present).sum(axis=1) / first.present.sum()
     at, other_at = first.position - middle[:, None], second.position - middle[:, None]
@@ -102,7 +101,7 @@ def motion_score(
     stacked = np.array(parts)
     # An offset with a long common time is not better for the only reason that motions resemble each other.
     stacked = np.asarray((stacked - np.median(stacked, axis=1)[:, None]) * sums.common)
-    return MotionScore(sums.lags_s, sums.common, stacked, np.asarray(np.array(weights_hz) @ stacked))
+    return MotionScore(sums.lags_s, sums.common, np.asarray(np.array(weights_hz) @ stacked))
 
 
 def mean_square_distance(first: MotionSignals, second: MotionSignals) -> float:
@@ -173,12 +172,12 @@ class _LagSums:
         twice = np.where(rows == columns, 0.5, 1.0)[:, None]
         beta_hat = self._transform(beta[rows] * beta[columns] * weights)
         counts = self._counts(weights)
-        out = np.empty((3, 3, len(self.lags_s)))
-        for i in range(3):
-            for j in range(i, 3):
-                products = twice * (alpha[i, rows] * alpha[j, columns] + alpha[i, columns] * alpha[j, rows])
-                out[i, j] = out[j, i] = self._sums(self._transform(products), beta_hat) / counts
-        return out
+
+        def moment(i: int, j: int) -> FloatArray:
+            products = twice * (alpha[i, rows] * alpha[j, columns] + alpha[i, columns] * alpha[j, rows])
+            return self._sums(self._transform(products), beta_hat) / counts
+
+        return _symmetric(moment)
 
     def means(self, alpha: FloatArray, beta: FloatArray, weights: FloatArray) -> FloatArray:
         """Return weighted means (3,L) of the vectors alpha·beta; arguments as in `second_moments`."""
@@ -199,13 +198,16 @@ class _LagSums:
         weights_hat = self._transform(weights)
         counts = self._counts(weights)
         energy = self._sums(self._present_hat, self._transform((other**2).sum(axis=0) * weights)) / counts
-        out = np.empty((3, 3, len(self.lags_s)))
-        for i in range(3):
-            for j in range(i, 3):
-                own_hat = self._transform(own[i] * own[j] * self._present)
-                out[i, j] = out[j, i] = self._sums(own_hat, weights_hat) / counts
-            out[i, i] += energy / 3.0
-        return out
+        moments = _symmetric(
+            lambda i, j: self._sums(self._transform(own[i] * own[j] * self._present), weights_hat) / counts
+        )
+        return moments + np.eye(3)[:, :, None] * (energy / 3.0)
+
+
+def _symmetric(entry: Callable[[int, int], FloatArray]) -> FloatArray:
+    """Return symmetric matrices (3,3,L) whose element (i,j) is `entry(i, j)`, (L,), for i ≤ j."""
+    upper = {(i, j): entry(i, j) for i in range(3) for j in range(i, 3)}
+    return np.array([[upper[min(i, j), max(i, j)] for j in range(3)] for i in range(3)])
 
 
 def _rotated(target_from_source: FloatArray, vectors: FloatArray) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -73,20 +73,20 @@ class MotionSignals:
         present: (N,) 1 where the camera was localised, else 0.
         position: (3,N) smoothed positions, map units.
         map_from_cam: (3,3,N) smoothed rotations.
-        velocities: (3,N) velocities of each band, map units per second.
-        turn_rates: (3,N) turn rates of each band, radians per second.
-        velocity_weights: (N,) weights of the samples of each velocity; 0 where the camera was lost.
-        turn_weights: (N,) weights of the samples of each turn rate.
+        velocities: (B,3,N) velocities of each band, map units per second.
+        turn_rates: (B,3,N) turn rates of each band, radians per second.
+        velocity_weights: (B,N) weights of the samples of each velocity; 0 where the camera was lost.
+        turn_weights: (B,N) weights of the samples of each turn rate.
     """
 
     first_step: int
     present: FloatArray
     position: FloatArray
     map_from_cam: FloatArray
-    velocities: tuple[FloatArray, ...]
-    turn_rates: tuple[FloatArray, ...]
-    velocity_weights: tuple[FloatArray, ...]
-    turn_weights: tuple[FloatArray, ...]
+    velocities: FloatArray
+    turn_rates: FloatArray
+    velocity_weights: FloatArray
+    turn_weights: FloatArray
 
     @property
     def count(self) -> int:
@@ -101,17 +101,9 @@ class MotionSignals:
     def part(self, start: int, stop: int) -> MotionSignals:
         """Return the samples from `start` to `stop`, in samples."""
         start, stop = max(start, 0), min(stop, self.count)
-        inside = slice(start, stop)
-        return MotionSignals(
-            first_step=self.first_step + start,
-            present=self.present[inside],
-            position=self.position[:, inside],
-            map_from_cam=self.map_from_cam[:, :, inside],
-            velocities=tuple(band[:, inside] for band in self.velocities),
-            turn_rates=tuple(band[:, inside] for band in self.turn_rates),
-            velocity_weights=tuple(weights[inside] for weights in self.velocity_weights),
-            turn_weights=tuple(weights[inside] for weights in self.turn_weights),
-        )
+        names = [each.name for each in fields(self) if each.name != "first_step"]
+        parts = {name: getattr(self, name)[..., start:stop] for name in names}
+        return MotionSignals(first_step=self.first_step + start, **parts)
 
 
 def motion_signals(path: CameraPath) -> MotionSignals | None:
@@ -142,8 +134,8 @@ def motion_signals(path: CameraPath) -> MotionSignals | None:
     mask = present[keep_steps].astype(np.float64)
     if mask.sum() < 2:
         return None
-    velocities = tuple(band[keep_steps].T.copy() for band in _bands(velocity, step_s))
-    turn_rates = tuple(band[keep_steps].T.copy() for band in _bands(turn_rate, step_s))
+    velocities = np.array([band[keep_steps].T for band in _bands(velocity, step_s)])
+    turn_rates = np.array([band[keep_steps].T for band in _bands(turn_rate, step_s)])
     return MotionSignals(
         first_step=first,
         present=mask,
@@ -151,8 +143,8 @@ def motion_signals(path: CameraPath) -> MotionSignals | None:
         map_from_cam=np.moveaxis(rotation[keep_steps], 0, -1).copy(),
         velocities=velocities,
         turn_rates=turn_rates,
-        velocity_weights=tuple(_weights(band, mask) for band in velocities),
-        turn_weights=tuple(_weights(band, mask) for band in turn_rates),
+        velocity_weights=np.array([_weights(band, mask) for band in velocities]),
+        turn_weights=np.array([_weights(band, mask) for band in turn_rates]),
     )
 
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodycap_batch.clocks.clock_pair import CRYSTAL_SIGMA_PPM, ClockPair
+from bodycap_batch.clocks.joint_offsets import MAX_DRIFT_PPM, ClockPair
 from bodycap_batch.clocks.phase_correlation import (
     PEAK_WIDTH_S,
     Peak,
@@ -57,8 +57,6 @@ memory to some megabytes."""
 _AGREEMENT_S = 0.003
 """Maximum difference, seconds, of a window's offset from the line of the others. Origin: between the ears of
 a body the way of sound differs by up to 3 ms, which changes as the arms move."""
-MAX_DRIFT_PPM = 150.0
-"""Maximum drift, ppm. Origin: twice the tolerance of crystals, with some room for cold and heat."""
 _CLEAR_LOG_CHANCE = float(np.log(0.01))
 """Logarithm of the probability below which the peak of a window counts. At most one of a hundred windows of
 unrelated sounds has such a peak."""
@@ -172,43 +170,28 @@ def measure_pair(
     if second.end_s - second.start_s < first.end_s - first.start_s:
         swapped = None if expected_s is None else (-expected_s[1], -expected_s[0])
         return _turned(measure_pair(second, first, swapped, trials))
-    best: PairOffset | None = None
-    for limits in [expected_s, None] if expected_s is not None else [None]:
-        found = _measure(first, second, limits, trials)
-        if found.accepted:
-            return found
-        if best is None or found.log_chance < best.log_chance:
+    best = _measure(first, second, expected_s, trials)
+    if expected_s is not None and not best.accepted:
+        found = _measure(first, second, None, trials)
+        if found.accepted or found.log_chance < best.log_chance:
             best = found
-    assert best is not None
     return best
 
 
 def _turned(pair: PairOffset) -> PairOffset:
     """Return the same result with the cameras exchanged."""
     chunks = tuple(
-        ChunkOffset(
-            time_s=chunk.time_s + chunk.offset_s,
-            offset_s=-chunk.offset_s,
-            height=chunk.height,
-            agrees=chunk.agrees,
-        )
+        replace(chunk, time_s=chunk.time_s + chunk.offset_s, offset_s=-chunk.offset_s)
         for chunk in pair.chunks
     )
-    return PairOffset(
+    return replace(
+        pair,
         first=pair.second,
         second=pair.first,
-        accepted=pair.accepted,
-        reason=pair.reason,
         channels=(pair.channels[1], pair.channels[0]),
         pivot_s=pair.pivot_s + pair.offset_s,
         offset_s=-pair.offset_s,
-        sigma_s=pair.sigma_s,
         drift_ppm=-pair.drift_ppm / (1.0 + 1e-6 * pair.drift_ppm),
-        drift_sigma_ppm=pair.drift_sigma_ppm,
-        drift_measured=pair.drift_measured,
-        evidence=pair.evidence,
-        rival_ratio=pair.rival_ratio,
-        log_chance=pair.log_chance,
         chunks=chunks,
         curve_lags_s=None if pair.curve_lags_s is None else -pair.curve_lags_s[::-1],
         curve=None if pair.curve is None else pair.curve[::-1].copy(),
@@ -496,45 +479,26 @@ def _decide(first: SoundTrack, second: SoundTrack, examined: Sequence[_Candidate
             best.times_s.tolist(), best.offsets_s.tolist(), best.heights.tolist(), best.agrees, strict=True
         )
     )
-    line = _fit_line(best)
-    lags, curve = _mean_curve(first, second, best, line)
-    return PairOffset(
+    pair = PairOffset(
         first=first.camera,
         second=second.camera,
         accepted=not reason,
         reason=reason,
         channels=(first.name, second.name),
-        pivot_s=line.pivot_s,
-        offset_s=line.offset_s,
-        sigma_s=line.sigma_s,
-        drift_ppm=line.drift_ppm,
-        drift_sigma_ppm=line.drift_sigma_ppm,
-        drift_measured=line.drift_measured,
         evidence=best.evidence,
         rival_ratio=ratio,
         log_chance=best.log_chance,
         chunks=chunks,
-        curve_lags_s=lags,
-        curve=curve,
     )
+    pair = _with_line(pair, best)
+    lags, curve = _mean_curve(first, second, best, pair)
+    return replace(pair, curve_lags_s=lags, curve=curve)
 
 
-@dataclass(frozen=True, slots=True)
-class _Line:
-    """Offset and drift of a pair; the attributes are those of `PairOffset`."""
-
-    pivot_s: float
-    offset_s: float
-    sigma_s: float = float("inf")
-    drift_ppm: float = 0.0
-    drift_sigma_ppm: float = CRYSTAL_SIGMA_PPM
-    drift_measured: bool = False
-
-
-def _fit_line(candidate: _Candidate) -> _Line:
-    """Fit offset and drift to the windows that agree."""
+def _with_line(pair: PairOffset, candidate: _Candidate) -> PairOffset:
+    """Return the pair with offset and drift of the windows that agree."""
     if not candidate.agrees.any():
-        return _Line(float(candidate.times_s.mean()), candidate.lag_s)
+        return replace(pair, pivot_s=float(candidate.times_s.mean()), offset_s=candidate.lag_s)
     times, offsets = candidate.times_s[candidate.agrees], candidate.offsets_s[candidate.agrees]
     pivot = float(times.mean())
     span = float(np.ptp(times))
@@ -549,16 +513,17 @@ def _fit_line(candidate: _Candidate) -> _Line:
         rest = offsets - constant - slope * (times - pivot)
         scale = max(1.4826 * float(np.median(np.abs(rest))), _SCATTER_FLOOR_S)
         weights = 1.0 / (1.0 + (rest / (2.0 * scale)) ** 2)
-    lever = float(np.sqrt((weights * (times - pivot) ** 2).sum()))
     sigma_s = scale / float(np.sqrt(weights.sum()))
+    pair = replace(pair, pivot_s=pivot, offset_s=constant, sigma_s=sigma_s)
     if not is_long:
-        return _Line(pivot, constant, sigma_s)
+        return pair
+    lever = float(np.sqrt((weights * (times - pivot) ** 2).sum()))
     drift_sigma = float(np.hypot(scale / lever, _SLOW_S / span))
-    return _Line(pivot, constant, sigma_s, 1e6 * slope, 1e6 * drift_sigma, drift_measured=True)
+    return replace(pair, drift_ppm=1e6 * slope, drift_sigma_ppm=1e6 * drift_sigma, drift_measured=True)
 
 
 def _mean_curve(
-    first: SoundTrack, second: SoundTrack, candidate: _Candidate, line: _Line
+    first: SoundTrack, second: SoundTrack, candidate: _Candidate, pair: PairOffset
 ) -> tuple[FloatArray, FloatArray]:
     """Return offsets (N,) and the mean energy (N,) of some windows' correlations, for the picture."""
     reach = round(_CURVE_S * RATE_HZ)
@@ -567,11 +532,11 @@ def _mean_curve(
     total = np.zeros(2 * reach + 1)
     for index in chosen.tolist():
         time = float(candidate.times_s[index])
-        offset = line.offset_s + 1e-6 * line.drift_ppm * (time - line.pivot_s)
+        offset = pair.offset_s + 1e-6 * pair.drift_ppm * (time - pair.pivot_s)
         correlation, zero_s = _window_correlation(first, second, time + offset, length, offset)
         at = len(correlation) // 2 + round((zero_s - offset) * RATE_HZ)
         energy = smoothed_energy(correlation**2) / max(float((correlation**2).mean()), 1e-20)
         part = energy[max(0, at - reach) : at + reach + 1][::-1]
         if len(part) == len(total):
             total += part / len(chosen)
-    return line.offset_s + (np.arange(2 * reach + 1) - reach) / RATE_HZ, total
+    return pair.offset_s + (np.arange(2 * reach + 1) - reach) / RATE_HZ, total

@@ -7,6 +7,7 @@ it may belong to another microphone. Then each channel of each stream is read as
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -18,11 +19,11 @@ import numpy.typing as npt
 
 from bodycap_batch.capture.timeline import ChapterClock, clock_of_chapter
 from bodycap_batch.capture.video import VideoFile, error_reason, open_container
-from bodycap_batch.clocks.recorders import Recorder, recorder_of
 from bodycap_batch.core.arrays import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from av.audio.frame import AudioFrame
+    from av.audio.stream import AudioStream
     from av.container import InputContainer
 
 RATE_HZ = 16_000
@@ -42,7 +43,7 @@ _HIGH_PASS_HZ = 150.0
 """Frequency, Hz, below which wind and handling are removed. Origin: the correlation uses 200 Hz and above. A
 strong sound below leaks into all frequencies where a window cuts it off."""
 _FILTER_SAMPLES = RATE_HZ
-"""Number of samples that are filtered at once. Evidence: none."""
+"""Number of samples that are filtered at once. Origin: limits the memory to some megabytes."""
 _FADE_SAMPLES = RATE_HZ // 50
 """Number of samples over which a piece starts and ends: 20 ms. Origin: a sudden start would be a sound that
 all recordings have."""
@@ -71,7 +72,42 @@ _LINE_WIDTH_HZ = 41
 _MAX_HUM = 0.8
 """Maximum share of the power of a track in such lines. Evidence: docs/decisions/clocks.md."""
 
+_MODEL_KEYS = (
+    "com.apple.quicktime.model",
+    "com.android.model",
+    "model",
+    "com.apple.quicktime.make",
+    "com.android.manufacturer",
+    "make",
+)
+"""Keys of container metadata that name the model of a camera or its maker."""
+
 Samples = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recorder:
+    """What a file says about the device and the encoder of its sound.
+
+    Attributes:
+        model: Name of the camera model; empty if it is unknown.
+        encoder: Container, codec and handlers. Equal cameras write equal values.
+        rate_hz: Samples per second of the sound.
+    """
+
+    model: str
+    encoder: tuple[str, ...]
+    rate_hz: int
+
+    def is_like(self, other: Recorder) -> bool:
+        """Return True if both files seem to come from cameras of the same model.
+
+        Cameras of different models relate sound and picture differently. If a model is unknown, cameras with
+        a difference of encoder or format are treated as different models.
+        """
+        if self.model and other.model:
+            return self.model == other.model
+        return (self.model, self.encoder, self.rate_hz) == (other.model, other.encoder, other.rate_hz)
 
 
 @dataclass(frozen=True, slots=True)
@@ -350,6 +386,25 @@ def _read_file(
                 )
 
 
+def recorder_of(container: InputContainer, stream: AudioStream) -> Recorder:
+    """Read what an opened file says about the device and the encoder of its sound."""
+    metadata = {key.lower(): value for key, value in container.metadata.items()}
+    model = " ".join(metadata[key] for key in _MODEL_KEYS if metadata.get(key))
+    # The first part of a GoPro's firmware version names the camera: HD5.02, H19.03.
+    firmware = re.match(r"^(H[A-Z]?\d+)\.", metadata.get("firmware", ""))
+    if not model and firmware:
+        model = firmware.group(1)
+    encoder = (
+        container.format.name,
+        metadata.get("major_brand", ""),
+        metadata.get("encoder", ""),
+        stream.codec_context.name,
+        str(stream.metadata.get("handler_name", "")).strip(),
+        str(stream.codec_context.layout.name),
+    )
+    return Recorder(model=model, encoder=encoder, rate_hz=int(stream.codec_context.sample_rate or 0))
+
+
 def _decode(container: InputContainer, readers: Mapping[int, _PieceReader]) -> str:
     """Decode all sound of the streams with these indices. Packets that are damaged are skipped.
 
@@ -388,9 +443,7 @@ class _PieceReader:
         self._separate = separate
         self._pieces: list[tuple[float, npt.NDArray[np.int16]]] = []
         self._parts: list[npt.NDArray[np.int16]] = []
-        self._waiting: list[npt.NDArray[np.int16]] = []
         self._resampler: Any = None
-        self._state: Any = None
         self._format: tuple[object, ...] = ()
         self._start_s = 0.0
         self._end_s = 0.0
@@ -410,7 +463,7 @@ class _PieceReader:
         self._count += frame.samples
         self._end_s = self._start_s + self._count / frame.sample_rate
         frame.pts = None
-        self._keep(frame)
+        self._resample(frame)
 
     def finish(self) -> list[tuple[float, npt.NDArray[np.int16]]]:
         """Return start (seconds) and samples (channels,N) of all pieces."""
@@ -426,9 +479,9 @@ class _PieceReader:
 
     def _close(self) -> None:
         if self._resampler is not None:
-            self._keep(None)
-        if self._parts:
-            samples = np.concatenate(self._parts, axis=1)
+            self._resample(None)
+        if any(part.shape[1] for part in self._parts):
+            samples = _filtered(np.concatenate(self._parts, axis=1))
             count = min(_FADE_SAMPLES, samples.shape[1] // 2)
             fade = 0.5 - 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / max(count, 1))
             samples[:, :count] = np.rint(samples[:, :count] * fade)
@@ -436,29 +489,26 @@ class _PieceReader:
                 samples[:, samples.shape[1] - count :] * fade[::-1]
             )
             self._pieces.append((self._start_s, samples))
-        self._parts, self._resampler, self._state, self._format = [], None, None, ()
+        self._parts, self._resampler, self._format = [], None, ()
 
-    def _keep(self, frame: AudioFrame | None) -> None:
-        self._waiting += [out.to_ndarray() for out in self._resampler.resample(frame)]
-        if frame is None or sum(part.shape[1] for part in self._waiting) >= _FILTER_SAMPLES:
-            self._filter()
+    def _resample(self, frame: AudioFrame | None) -> None:
+        self._parts += [out.to_ndarray() for out in self._resampler.resample(frame)]
 
-    def _filter(self) -> None:
-        """Remove the low frequencies from the samples that wait. The filter is slow for short parts."""
-        if not sum(part.shape[1] for part in self._waiting):
-            return
-        samples = np.concatenate(self._waiting, axis=1).astype(np.float64)
-        self._waiting = []
-        # Imported here, because the import takes a second and many captures have no sound.
-        from scipy.signal import sosfilt, sosfilt_zi
 
-        high_pass = _high_pass()
-        if self._state is None:
-            self._state = sosfilt_zi(high_pass)[:, None, :] * samples[:, :1]
-        # The same filter delays the sound of all cameras alike. The constant prevents tiny numbers, which are
-        # slow.
-        filtered, self._state = sosfilt(high_pass, samples + 1e-3, zi=self._state)
-        self._parts.append(np.clip(np.rint(filtered), -32768, 32767).astype(np.int16))
+def _filtered(samples: npt.NDArray[np.int16]) -> npt.NDArray[np.int16]:
+    """Return samples (channels,N) without the low frequencies."""
+    # Imported here, because the import takes a second and many captures have no sound.
+    from scipy.signal import sosfilt, sosfilt_zi
+
+    high_pass, out = _high_pass(), np.empty_like(samples)
+    state = sosfilt_zi(high_pass)[:, None, :] * samples[:, :1].astype(np.float64)
+    # The same filter delays the sound of all cameras alike. The constant prevents tiny numbers, which are
+    # slow.
+    for first in range(0, samples.shape[1], _FILTER_SAMPLES):
+        part = slice(first, first + _FILTER_SAMPLES)
+        filtered, state = sosfilt(high_pass, samples[:, part].astype(np.float64) + 1e-3, zi=state)
+        out[:, part] = np.clip(np.rint(filtered), -32768, 32767)
+    return out
 
 
 @cache

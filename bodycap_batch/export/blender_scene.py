@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.config.options import ExportOptions
+from bodycap_batch.export.camera_animation import lens_of
 from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.take_time import take_of_motion
 from bodycap_batch.export.target_frames import WORLD, trajectories_in_target_frames
@@ -31,7 +32,7 @@ def collect_blender_scene(inputs: ExportInputs, motion: Motion, options: ExportO
     """
     cameras: dict[str, Any] = {}
     for path in trajectories_in_target_frames(inputs):
-        lens = next((s.cameras[path.camera] for s in inputs.maps if path.camera in s.cameras), None)
+        lens = lens_of(inputs, path.camera)
         if path.gauge == WORLD and path.localised.any() and lens is not None:
             cameras[path.camera] = _camera(inputs, path, lens, motion)
     return {

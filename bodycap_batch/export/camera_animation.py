@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.far_points import is_far
 from bodycap_batch.export.take_time import frame_times_ns, frames_without_motion, take_of_motion
@@ -15,6 +15,7 @@ from bodycap_batch.export.target_frames import (
     maps_in_target_frames,
     trajectories_in_target_frames,
 )
+from bodycap_batch.formats.ply import Colors
 from bodycap_batch.model.animated_camera import AnimatedCamera, CameraScene
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.camera_clock import CameraClock
@@ -90,12 +91,9 @@ def picture_size(lens: Camera, shown: tuple[int, int] | None) -> tuple[int, int]
 
 def _animated(inputs: ExportInputs, path: Trajectory, take: Take, count: int) -> AnimatedCamera:
     """Return one camera with its pose at each frame: that of the nearest picture that can be shown."""
-    lens, clock, video = (
-        lens_of(inputs, path.camera),
-        inputs.clocks[path.camera],
-        inputs.videos.get(path.camera),
-    )
+    lens, clock = lens_of(inputs, path.camera), inputs.clocks[path.camera]
     assert lens is not None
+    video = inputs.videos.get(path.camera)
     common = clock.common_times_ns(path.times_ns)
     frames = frame_times_ns(take, count)
     pictures = np.flatnonzero([status is not FrameStatus.DAMAGED for status in path.status])
@@ -118,11 +116,7 @@ def _animated(inputs: ExportInputs, path: Trajectory, take: Take, count: int) ->
     )
 
 
-def _held(
-    shown: IntArray,
-    valid: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
-    is_measured: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
-) -> IntArray:
+def _held(shown: IntArray, valid: BoolArray, is_measured: BoolArray) -> IntArray:
     """Return the index (T,) of the pose of each frame: that of the last valid frame, else the first one."""
     if not valid.any():  # the camera was localised, but not while the body moves
         return np.full(len(shown), np.flatnonzero(is_measured)[0], dtype=np.int64)
@@ -150,9 +144,8 @@ def _middle_row_poses(path: Trajectory, clock: CameraClock, row_fraction: FloatA
     index = np.flatnonzero(path.localised & (later_s != 0.0))
     other = index - np.sign(later_s[index]).astype(np.int64)
     inside = (other >= 0) & (other < len(poses))
+    inside[inside] = path.localised[other[inside]]
     index, other = index[inside], other[inside]
-    both = path.localised[other]
-    index, other = index[both], other[both]
     share = (path.times_ns[index] * 1e-9 - at_s[index]) / (at_s[other] - at_s[index])
     near = (share >= 0.0) & (share <= 1.0)
     index, other, share = index[near], other[near], share[near]
@@ -161,15 +154,13 @@ def _middle_row_poses(path: Trajectory, clock: CameraClock, row_fraction: FloatA
     return poses
 
 
-def _sigma(covariance: FloatArray, valid: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> FloatArray:
+def _sigma(covariance: FloatArray, valid: BoolArray) -> FloatArray:
     """Return the standard deviation (T,) per axis of covariances (T,3,3); NaN if a frame is not valid."""
     variance = np.trace(covariance, axis1=1, axis2=2) / 3.0
     return np.where(valid, np.sqrt(np.maximum(variance, 0.0)), np.nan)
 
 
-def _room(
-    inputs: ExportInputs, target: str
-) -> tuple[FloatArray, np.ndarray[tuple[int, ...], np.dtype[np.uint8]]]:
+def _room(inputs: ExportInputs, target: str) -> tuple[FloatArray, Colors]:
     """Return the points of the room in the main target frame, without far points, and their colours."""
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.uint8)]
     for item in maps_in_target_frames(inputs):

@@ -18,6 +18,9 @@ from bodycap_batch.formats.gltf import read_camera_glb, write_camera_glb
 from bodycap_batch.formats.usd_cameras import read_camera_usd, write_camera_usd
 from bodycap_batch.model.animated_camera import CameraScene
 
+Writer = Callable[[Path, CameraScene], Path]
+Reader = Callable[[Path], dict[str, tuple[float, FloatArray]]]
+
 CAMERA_FORMATS = ("glb", "usd", "fbx", "chan", "abc")
 """Formats that hold animated cameras."""
 CAMERA_FACTS_FILE = "cameras.json"
@@ -35,14 +38,9 @@ def camera_writers(folder: Path, scene: CameraScene) -> dict[str, Callable[[], l
         scene: The cameras and the room.
     """
 
-    def glb() -> list[Path]:
-        path = write_camera_glb(folder / "cameras.glb", scene)
-        _verify(path, scene, read_camera_glb(path))
-        return [path]
-
-    def usd() -> list[Path]:
-        path = write_camera_usd(folder / "cameras.usd", scene)
-        _verify(path, scene, read_camera_usd(path))
+    def whole(name: str, write: Writer, read: Reader) -> list[Path]:
+        path = write(folder / name, scene)
+        _verify(path, scene, read(path))
         return [path]
 
     def chan() -> list[Path]:
@@ -53,13 +51,13 @@ def camera_writers(folder: Path, scene: CameraScene) -> dict[str, Callable[[], l
                 frames, fov, poses = read_chan(path)
                 held = camera.scene_from_gl().copy()
                 held[frames] = poses
-                _verify(path, scene, {camera.name: (fov, held)}, of=camera.name)
+                _verify(path, replace(scene, cameras=(camera,)), {camera.name: (fov, held)})
                 written.append(path)
         return written
 
     return {
-        "glb": glb,
-        "usd": usd,
+        "glb": lambda: whole("cameras.glb", write_camera_glb, read_camera_glb),
+        "usd": lambda: whole("cameras.usd", write_camera_usd, read_camera_usd),
         "fbx": lambda: [write_cameras_with_blender(folder / "cameras.fbx", scene)],
         "chan": chan,
         # Blender writes several cameras into an Alembic file in another order each time.
@@ -92,17 +90,13 @@ def write_camera_facts(path: Path, scene: CameraScene) -> Path:
     return path
 
 
-def _verify(
-    path: Path, scene: CameraScene, found: dict[str, tuple[float, FloatArray]], of: str | None = None
-) -> None:
+def _verify(path: Path, scene: CameraScene, found: dict[str, tuple[float, FloatArray]]) -> None:
     """Compare cameras that were read back with the written cameras. A file that differs is deleted.
 
     Raises:
         StoreError: A camera is missing, or its field of view or a pose differs too much.
     """
     for camera in scene.cameras:
-        if of is not None and camera.name != of:
-            continue
         expected = camera.scene_from_gl()
         fov, poses = found.get(camera.name, (np.nan, np.full_like(expected, np.nan)))
         reach = max(1.0, float(np.abs(expected[:, :3, 3]).max()))

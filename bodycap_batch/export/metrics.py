@@ -5,7 +5,6 @@ The metrics contain no run times, dates and host names, so equal jobs give equal
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -22,6 +21,7 @@ from bodycap_batch.export.target_frames import (
     maps_in_target_frames,
     trajectories_in_target_frames,
 )
+from bodycap_batch.formats.dataclass_files import json_value
 from bodycap_batch.model.geometry import invert, rotation_angle_rad, transform_points
 from bodycap_batch.model.path_uncertainty import path_uncertainty
 from bodycap_batch.model.relative_pose import RelativePose
@@ -86,7 +86,7 @@ def collect_metrics(inputs: ExportInputs, motion: Motion | None, gap: Mapping[st
             out["merge"]["skeleton"] = {"notes": skeleton.notes, "warnings": skeleton.warnings}
     if motion is not None:
         out["motion"] = _motion_metrics(motion, gap)
-    return dict(_json_value(out))
+    return dict(json_value(out))
 
 
 def _clock_metrics(inputs: ExportInputs, camera: str) -> dict[str, Any]:
@@ -162,15 +162,8 @@ def _camera_metrics(
     """
     name = trajectory.camera
     registered = trajectory.registered
-    own_observations = [
-        (
-            np.array([camera == name for camera in scene.keyframe_camera], dtype=bool)[scene.obs_keyframe],
-            scene,
-        )
-        for scene in inputs.maps
-    ]
-    own_errors = (e[own] for (own, _), e in zip(own_observations, errors, strict=True))
-    map_errors = np.concatenate([np.zeros(0), *own_errors])
+    own = [np.isin(scene.obs_keyframe, scene.keyframes_of(name)) for scene in inputs.maps]
+    map_errors = np.concatenate([np.zeros(0), *(each[seen] for each, seen in zip(errors, own, strict=True))])
     selected = [len(item.frames) for item in inputs.selections if item.camera == name]
     return {
         "frame": trajectory.gauge,
@@ -183,8 +176,10 @@ def _camera_metrics(
         "status": dict(sorted(Counter(status.value for status in trajectory.status).items())),
         "keyframes_selected": sum(selected) if selected else None,
         "keyframes": sum(scene.keyframe_camera.count(name) for scene in inputs.maps),
-        "points": sum(len(np.unique(scene.obs_point[own])) for own, scene in own_observations),
-        "measurements": sum(int(own.sum()) for own, _ in own_observations),
+        "points": sum(
+            len(np.unique(scene.obs_point[seen])) for scene, seen in zip(inputs.maps, own, strict=True)
+        ),
+        "measurements": sum(int(seen.sum()) for seen in own),
         "mean_reprojection_error_px": _finite_mean(map_errors),
         "registration": _registration_metrics(trajectory),
         **path_uncertainty(trajectory),
@@ -286,16 +281,3 @@ def _finite_mean(values: FloatArray) -> float | None:
     """Return the mean of the finite values; None if there are no finite values."""
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else None
-
-
-def _json_value(value: Any) -> Any:
-    """Convert a value to plain JSON values. NumPy types are converted, and NaN and infinity become null."""
-    if isinstance(value, Mapping):
-        return {str(key): _json_value(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_json_value(item) for item in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return _json_value(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

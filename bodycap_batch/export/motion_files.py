@@ -11,14 +11,9 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.c3d import LabelledPoints
+from bodycap_batch.formats.fbx.writer import POSITION_TOLERANCE_M
 from bodycap_batch.model.geometry import rotation_angle_rad
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
-
-POSITION_TOLERANCE_M = 1e-4
-"""Maximum accepted distance (metres) between a joint centre in the file and in the motion.
-
-Derivation: the limit is larger than the rounding of all formats, and an animator cannot see it.
-"""
 
 ANGLE_TOLERANCE_DEG = 0.01
 """Maximum accepted angle (degrees) between the orientations of a joint in the file and in the motion.

@@ -10,10 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bodycap_batch.config.options import ExportOptions
-from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.export.blender_scene import collect_blender_scene
 from bodycap_batch.export.camera_animation import collect_camera_scene
@@ -26,8 +23,6 @@ from bodycap_batch.export.camera_files import (
 from bodycap_batch.export.earth import earth_of_world
 from bodycap_batch.export.export_inputs import ExportInputs
 from bodycap_batch.export.fill_report import FILL_FILE, write_fill_report
-from bodycap_batch.export.frame_table import write_frame_table
-from bodycap_batch.export.joint_tables import write_joint_arrays, write_joint_table
 from bodycap_batch.export.layout import added_root, apply_layout
 from bodycap_batch.export.metrics import collect_metrics
 from bodycap_batch.export.motion_files import (
@@ -37,6 +32,7 @@ from bodycap_batch.export.motion_files import (
     without_unsolved_branches,
 )
 from bodycap_batch.export.scene_files import write_colmap, write_maps, write_trajectories
+from bodycap_batch.export.tables import write_frame_table, write_joint_arrays, write_joint_table
 from bodycap_batch.export.take_time import take_of_motion
 from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.formats.blender import write_blender_files
@@ -50,6 +46,9 @@ from bodycap_batch.formats.usd import read_usd, write_usd
 from bodycap_batch.model.bone_axes import align_axes_with_bones
 from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.model.skeleton import Motion, with_file_zero_pose, with_outer_joints
+
+Steps = dict[str, list[Callable[[], list[Path]]]]
+"""The functions that write the files of each format."""
 
 LEFT_OUT = "left_out"
 """Name of the list in ``metrics.json`` with a sentence about each empty part that the files leave out."""
@@ -80,34 +79,31 @@ def export_results(inputs: ExportInputs, options: ExportOptions, context: StageC
     left_out: list[str] = []
     motion, gap = _exported_motion(inputs, options, left_out)
     animated = None if motion is None else apply_layout(_with_all_joints(inputs, motion, options), options)
-    sigma_m = None if inputs.merge is None or motion is None else _exported_sigma_m(inputs.merge, motion)
-    steps: dict[str, Callable[[], list[Path]]] = {"tum": lambda: write_trajectories(inputs, left_out)}
+    steps: Steps = {"tum": [lambda: write_trajectories(inputs, left_out)]}
     if inputs.maps:
-        steps |= {"ply": lambda: write_maps(inputs, left_out), "colmap": lambda: write_colmap(inputs)}
-    steps["csv"] = lambda: [write_frame_table(inputs.out_dir / "frames.csv", inputs)]
-    if motion is not None and animated is not None:
-        steps |= _motion_writers(inputs, motion, animated, options, sigma_m, left_out)
-        steps["csv"] = lambda: [
-            write_frame_table(inputs.out_dir / "frames.csv", inputs),
-            write_joint_table(inputs.out_dir / "joints.csv", motion, sigma_m),
-        ]
-    steps = {name: write for name, write in steps.items() if name in options.formats}
-    _add_cameras(steps, inputs, animated, options, left_out)
+        steps |= {"ply": [lambda: write_maps(inputs, left_out)], "colmap": [lambda: write_colmap(inputs)]}
+    steps["csv"] = [lambda: [write_frame_table(inputs.out_dir / "frames.csv", inputs)]]
     merge = inputs.merge
+    if merge is not None and motion is not None and animated is not None:
+        of_motion = _motion_writers(inputs, merge, motion, animated, options, left_out)
+        steps["csv"] += of_motion.pop("csv")
+        steps |= of_motion
+    steps = {name: writers for name, writers in steps.items() if name in options.formats}
+    _add_cameras(steps, inputs, animated, options, left_out)
     if merge is not None and merge.fill is not None:
-        steps["fill"] = lambda: [write_fill_report(inputs.out_dir / FILL_FILE, merge)]
-    steps["metrics"] = lambda: [_write_metrics(inputs, motion, gap, left_out)]
+        steps["fill"] = [lambda: [write_fill_report(inputs.out_dir / FILL_FILE, merge)]]
+    steps["metrics"] = [lambda: [_write_metrics(inputs, motion, gap, left_out)]]
     written: list[Path] = []
-    for number, (name, write) in enumerate(steps.items()):
+    for number, (name, writers) in enumerate(steps.items()):
         context.check_cancelled()
         context.progress(number, len(steps), name)
-        written += write()
+        written += [path for write in writers for path in write()]
     context.progress(len(steps), len(steps), "")
     return tuple(path.relative_to(inputs.out_dir) for path in written)
 
 
 def _add_cameras(
-    steps: dict[str, Callable[[], list[Path]]],
+    steps: Steps,
     inputs: ExportInputs,
     animated: Motion | None,
     options: ExportOptions,
@@ -120,35 +116,29 @@ def _add_cameras(
         return
     writers = camera_writers(inputs.out_dir, scene)
     for name in chosen:
-        steps[name] = _both(steps.get(name), writers[name])
-    steps["cameras"] = lambda: [write_camera_facts(inputs.out_dir / CAMERA_FACTS_FILE, scene)]
-
-
-def _both(
-    first: Callable[[], list[Path]] | None, second: Callable[[], list[Path]]
-) -> Callable[[], list[Path]]:
-    """Return a function that calls both functions and returns both lists of files."""
-    return second if first is None else lambda: [*first(), *second()]
+        steps.setdefault(name, []).append(writers[name])
+    steps["cameras"] = [lambda: [write_camera_facts(inputs.out_dir / CAMERA_FACTS_FILE, scene)]]
 
 
 def _motion_writers(
     inputs: ExportInputs,
+    merge: MergeResult,
     motion: Motion,
     animated: Motion,
     options: ExportOptions,
-    sigma_m: FloatArray | None,
     left_out: list[str],
-) -> dict[str, Callable[[], list[Path]]]:
+) -> Steps:
     """Return, for each motion format, a function that writes its file.
 
     The animation formats (BVH, GLB, FBX, USD) contain the motion in the layout that the options select. In
     GLB and FBX files, the joints' axes follow the bones, because programs draw bones along these axes. The
     measurement formats (C3D, TRC, NPZ) contain the solved motion.
     """
-    folder, measured = inputs.out_dir, _measured_joints(inputs, motion)
+    kept = [merge.skeleton.joints.index(name) for name in motion.skeleton.joints]
+    folder, measured, sigma_m = inputs.out_dir, merge.solved[kept], merge.joint_sigma_m()[:, kept]
     take, solved_take = take_of_motion(inputs, animated), take_of_motion(inputs, motion)
     centres = points_from_motion(motion, measured, sigma_m)
-    sigma = None if sigma_m is None else sigma_in_layout(motion, animated, sigma_m)
+    sigma = sigma_in_layout(motion, animated, sigma_m)
     aligned, place = align_axes_with_bones(animated), earth_of_world(inputs)
     earth = None if place is None else place.figures()
     markers = points_from_motion(motion, None if options.filled_markers else measured)
@@ -172,14 +162,15 @@ def _motion_writers(
         return verified(folder / "motion.usd", animated, read_usd)
 
     return {
-        "bvh": bvh,
-        "glb": glb,
-        "fbx": lambda: [write_fbx(folder / "motion.fbx", aligned, take)],
-        "usd": usd,
-        "c3d": lambda: [write_c3d(folder / "joints.c3d", centres, solved_take)],
-        "trc": trc,
-        "npz": lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m, solved_take)],
-        "blender": lambda: write_blender_files(folder, collect_blender_scene(inputs, aligned, options)),
+        "csv": [lambda: [write_joint_table(folder / "joints.csv", motion, sigma_m)]],
+        "bvh": [bvh],
+        "glb": [glb],
+        "fbx": [lambda: [write_fbx(folder / "motion.fbx", aligned, take)]],
+        "usd": [usd],
+        "c3d": [lambda: [write_c3d(folder / "joints.c3d", centres, solved_take)]],
+        "trc": [trc],
+        "npz": [lambda: [write_joint_arrays(folder / "joints.npz", motion, sigma_m, solved_take)]],
+        "blender": [lambda: write_blender_files(folder, collect_blender_scene(inputs, aligned, options))],
     }
 
 
@@ -192,20 +183,6 @@ def _with_all_joints(inputs: ExportInputs, motion: Motion, options: ExportOption
     if merge is None or motion.skeleton.joints != merge.skeleton.joints or added_root(motion, options):
         return motion
     return with_file_zero_pose(with_outer_joints(merge.motion))
-
-
-def _measured_joints(inputs: ExportInputs, motion: Motion) -> BoolArray | None:
-    """Return (J,) which exported joints were measured; None without a body."""
-    if inputs.merge is None:
-        return None
-    kept = [inputs.merge.skeleton.joints.index(name) for name in motion.skeleton.joints]
-    return np.asarray(inputs.merge.solved[kept])
-
-
-def _exported_sigma_m(merge: MergeResult, motion: Motion) -> FloatArray:
-    """Return the standard deviation (T,J) of each exported joint's centre, metres; NaN if not solved."""
-    kept = [merge.skeleton.joints.index(name) for name in motion.skeleton.joints]
-    return merge.joint_sigma_m()[:, kept]
 
 
 def _write_metrics(

@@ -14,9 +14,8 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.formats.bvh.euler import continuous_angles, rotation_from_angles
-from bodycap_batch.formats.gltf.axes import FILE_FROM_WORLD
+from bodycap_batch.formats.y_up import camera_poses_with_y_up, poses_from_y_up
 from bodycap_batch.model.animated_camera import AnimatedCamera
-from bodycap_batch.model.geometry import make_transform
 
 FIRST_FRAME = 1
 """Number of the first frame in the file. Origin: Nuke's scripts begin at frame 1."""
@@ -36,7 +35,7 @@ def write_chan(path: Path, camera: AnimatedCamera) -> Path:
         StoreError: The file cannot be written.
     """
     frames = np.flatnonzero(camera.valid)
-    poses = make_transform(FILE_FROM_WORLD, np.zeros(3)) @ camera.scene_from_gl()[frames]
+    poses = camera_poses_with_y_up(camera)[frames]
     y, x, z = np.degrees(continuous_angles((_LEFTMOST_FIRST,), poses[:, None, :3, :3])[:, 0]).T
     fov = np.full(len(frames), np.degrees(camera.vertical_fov_rad))
     rows = np.column_stack([poses[:, :3, 3], x, y, z, fov]) + 0.0
@@ -55,6 +54,6 @@ def read_chan(path: Path) -> tuple[IntArray, float, FloatArray]:
     """
     rows = np.loadtxt(path, ndmin=2)
     angles = np.radians(rows[:, [5, 4, 6]])
-    rotation = FILE_FROM_WORLD.T @ rotation_from_angles(_LEFTMOST_FIRST, angles)
+    rotation = rotation_from_angles(_LEFTMOST_FIRST, angles)
     frames = rows[:, 0].astype(np.int64) - FIRST_FRAME
-    return frames, float(np.radians(rows[0, 7])), make_transform(rotation, rows[:, 1:4] @ FILE_FROM_WORLD)
+    return frames, float(np.radians(rows[0, 7])), poses_from_y_up(rotation, rows[:, 1:4])

@@ -26,10 +26,6 @@ from bodycap_batch.core.errors import StoreError
 T = TypeVar("T")
 Arrays = dict[str, np.ndarray[Any, Any]]
 
-_ZIP_DATE = (1980, 1, 1, 0, 0, 0)
-"""Date of every zip entry: the earliest date that the zip format supports. The date is constant, so that
-equal arrays give equal bytes."""
-
 
 def write_dataclass(value: Any, folder: Path, name: str) -> None:
     """Write a dataclass instance as ``<name>.json`` and, if it contains arrays, ``<name>.npz``.
@@ -41,7 +37,7 @@ def write_dataclass(value: Any, folder: Path, name: str) -> None:
         name: Name of the files without suffix.
     """
     arrays: Arrays = {}
-    encoded = _encode(value, type(value), _Location(folder, arrays))
+    encoded = _convert(value, type(value), _Location(folder, arrays), writes=True)
     document = {"type": type(value).__name__, "value": encoded}
     text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
     (folder / f"{name}.json").write_text(text + "\n", encoding="utf-8")
@@ -62,7 +58,8 @@ def read_dataclass(cls: type[T], folder: Path, name: str) -> T:
             raise StoreError(f"the folder contains a {document['type']}, not a {cls.__name__}", path=path)
         archive = folder / f"{name}.npz"
         arrays = read_npz(archive) if archive.exists() else {}
-        return typing.cast(T, _decode(document["value"], cls, _Location(folder, arrays)))
+        value = _convert(document["value"], cls, _Location(folder, arrays), writes=False)
+        return typing.cast(T, value)
     except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         hint = "remove the folder; the next run creates the folder again"
         raise StoreError(f"the stored result cannot be read: {error}", path=path, hint=hint) from error
@@ -74,7 +71,8 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
         for name, array in arrays.items():
             buffer = io.BytesIO()
             np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy", _ZIP_DATE), buffer.getbuffer())
+            # The date of a ZipInfo is a constant, so that equal arrays give equal bytes.
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), buffer.getbuffer())
 
 
 def read_npz(path: Path) -> Arrays:
@@ -103,61 +101,56 @@ class _Location:
         return dataclasses.replace(self, name=name)
 
 
-def _encode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911 - one return per kind of type
-    """Convert a value of type `hint` to JSON values, and add its arrays to `location.arrays`."""
+def _convert(value: Any, hint: Any, at: _Location, *, writes: bool) -> Any:  # noqa: PLR0911 - one return per kind of type
+    """Convert a value of type `hint` to JSON values and arrays, or these back to the value.
+
+    Args:
+        value: The value, or its JSON values.
+        hint: Declared type of the value.
+        at: Position of the value. Its arrays are added to `at.arrays`, or taken from it.
+        writes: True to convert to JSON values, False to convert back.
+    """
     hint = _strip_none(hint)
     origin = typing.get_origin(hint) or hint
+    kind = origin if isinstance(origin, type) else object
     if value is None:
         return None
-    if origin is np.ndarray:
-        location.arrays[location.name] = value
-        return location.name
-    if hasattr(hint, "to_dict"):
-        return _json_value(value.to_dict())
+    if kind is np.ndarray:
+        if not writes:
+            return at.arrays[value]
+        at.arrays[at.name] = value
+        return at.name
+    if hasattr(hint, "to_dict" if writes else "from_dict"):
+        return json_value(value.to_dict()) if writes else hint.from_dict(value)
     if dataclasses.is_dataclass(hint):
         hints = typing.get_type_hints(hint)
-        names = [field.name for field in dataclasses.fields(hint)]
-        return {name: _encode(getattr(value, name), hints[name], location.inner(name)) for name in names}
-    if origin is tuple:
-        inner = _element_hints(hint, len(value))
-        return [_encode(value[i], inner[i], location.inner(i)) for i in range(len(value))]
-    if isinstance(origin, type) and issubclass(origin, Mapping):
+        found = (
+            {each.name: getattr(value, each.name) for each in dataclasses.fields(hint)} if writes else value
+        )
+        parts = {
+            name: _convert(part, hints[name], at.inner(name), writes=writes) for name, part in found.items()
+        }
+        return parts if writes else typing.cast(type, hint)(**parts)
+    if kind is tuple:
+        inner = zip(value, _element_hints(hint, len(value)), strict=True)
+        elements = [
+            _convert(each, inner_hint, at.inner(index), writes=writes)
+            for index, (each, inner_hint) in enumerate(inner)
+        ]
+        return elements if writes else tuple(elements)
+    if issubclass(kind, Mapping):
         inner_hint = (*typing.get_args(hint), Any, Any)[1]
-        return {str(key): _encode(value[key], inner_hint, location.inner(key)) for key in value}
-    if isinstance(origin, type) and issubclass(origin, Enum):
-        return value.value
-    if isinstance(origin, type) and issubclass(origin, Path):
-        return Path(value).resolve().relative_to(location.folder.resolve()).as_posix()
-    if origin is float:
-        return float(value) if math.isfinite(value) else str(float(value))
-    return _json_value(value)
-
-
-def _decode(value: Any, hint: Any, location: _Location) -> Any:  # noqa: PLR0911 - one return per kind of type
-    """Convert JSON values from `_encode` back to a value of type `hint`."""
-    hint = _strip_none(hint)
-    origin = typing.get_origin(hint) or hint
-    if value is None:
-        return None
-    if origin is np.ndarray:
-        return location.arrays[value]
-    if hasattr(hint, "from_dict"):
-        return hint.from_dict(value)
-    if dataclasses.is_dataclass(hint):
-        hints = typing.get_type_hints(hint)
-        parts = {name: _decode(part, hints[name], location.inner(name)) for name, part in value.items()}
-        return typing.cast(type, hint)(**parts)
-    if origin is tuple:
-        inner = _element_hints(hint, len(value))
-        return tuple(_decode(value[i], inner[i], location.inner(i)) for i in range(len(value)))
-    if isinstance(origin, type) and issubclass(origin, Mapping):
-        inner_hint = (*typing.get_args(hint), Any, Any)[1]
-        return {key: _decode(part, inner_hint, location.inner(key)) for key, part in value.items()}
-    if isinstance(origin, type) and issubclass(origin, Enum):
-        return origin(value)
-    if isinstance(origin, type) and issubclass(origin, Path):
-        return location.folder / value
-    return float(value) if origin is float else value
+        return {
+            str(key): _convert(part, inner_hint, at.inner(key), writes=writes) for key, part in value.items()
+        }
+    if issubclass(kind, Enum):
+        return value.value if writes else kind(value)
+    if issubclass(kind, Path):
+        folder = at.folder.resolve()
+        return Path(value).resolve().relative_to(folder).as_posix() if writes else at.folder / value
+    if kind is float:
+        return float(value) if not writes or math.isfinite(value) else str(float(value))
+    return json_value(value) if writes else value
 
 
 def _strip_none(hint: Any) -> Any:
@@ -177,14 +170,14 @@ def _element_hints(hint: Any, count: int) -> tuple[Any, ...]:
     return (hints[0],) * count if len(hints) == 2 and hints[1] is Ellipsis else hints
 
 
-def _json_value(value: Any) -> Any:
+def json_value(value: Any) -> Any:
     """Convert a value without a declared type to JSON values. NaN and infinity become null."""
     if isinstance(value, Mapping):
-        return {str(key): _json_value(part) for key, part in value.items()}
+        return {str(key): json_value(part) for key, part in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_json_value(part) for part in value]
+        return [json_value(part) for part in value]
     if isinstance(value, (np.generic, np.ndarray)):
-        return _json_value(value.tolist())
+        return json_value(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if value is None or isinstance(value, (bool, int, float, str)):

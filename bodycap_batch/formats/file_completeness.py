@@ -183,7 +183,7 @@ def _missing_box(stream: BinaryIO, size: int) -> MissingPart | None:
     found: set[bytes] = set()
     in_fragments = is_owed = False
     second = 0
-    for kind, start, content, end in _boxes(stream, 0, size):
+    for kind, start, content, end in boxes(stream, 0, size):
         has_frames = {b"moov", b"mdat"} <= found
         if (kind == b"" or end > size) and has_frames and not in_fragments and kind not in _MOVIE_BOXES:
             return None
@@ -198,7 +198,7 @@ def _missing_box(stream: BinaryIO, size: int) -> MissingPart | None:
                 return MissingPart(text=text, readable_bytes=size if in_fragments else second)
             return MissingPart(text=text, readable_bytes=start if has_frames else 0)
         if kind == b"moov":
-            in_fragments = any(inner[0] == b"mvex" for inner in _boxes(stream, content, end))
+            in_fragments = any(inner[0] == b"mvex" for inner in boxes(stream, content, end))
         is_owed = kind == b"moof" or (is_owed and kind != b"mdat")
         found.add(kind)
     if is_owed:
@@ -222,7 +222,7 @@ def movie_starts(stream: BinaryIO, size: int) -> list[int]:
     """
     starts: list[int] = []
     latest = 0
-    for kind, start, _, end in _boxes(stream, 0, size):
+    for kind, start, _, end in boxes(stream, 0, size):
         latest = start if kind == b"ftyp" else latest
         if kind == b"moov" and latest not in starts and end <= size:
             starts.append(latest)
@@ -238,7 +238,7 @@ def first_box(path: Path, kind: bytes) -> bytes:
     """
     with path.open("rb", buffering=0) as stream:
         head = stream.read(_BOX_HEADER)
-        for found, _, content, end in _boxes(
+        for found, _, content, end in boxes(
             stream, 0, path.stat().st_size if head[4:] in _FIRST_BOXES else 0
         ):
             if found == kind:
@@ -247,7 +247,7 @@ def first_box(path: Path, kind: bytes) -> bytes:
     return b""
 
 
-def _boxes(stream: BinaryIO, position: int, size: int) -> Iterator[tuple[bytes, int, int, int]]:
+def boxes(stream: BinaryIO, position: int, size: int) -> Iterator[tuple[bytes, int, int, int]]:
     """Yield the type, the start, the start of the content, and the end of each box between two positions.
 
     The type is empty for a box whose header is cut. The boxes end at data that are not a box: data of the

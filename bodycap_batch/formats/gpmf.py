@@ -11,16 +11,19 @@ Source: the GPMF key-length-value format, published by GoPro.
 
 from __future__ import annotations
 
+import itertools
 import re
 import struct
+from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.formats.file_completeness import boxes
 
 _CONTAINER_BOXES = (b"moov", b"udta")
 _GOPRO_BOX = b"GPMF"
@@ -53,11 +56,11 @@ _MAX_DEPTH = 8
 _MAX_COLUMNS = 256
 """Maximum number of values of one sample: a sample has at most 255 bytes."""
 
-_DTYPES = {
+DTYPES = {
     "b": ">i1", "B": ">u1", "s": ">i2", "S": ">u2", "l": ">i4", "L": ">u4", "j": ">i8", "J": ">u8",
     "f": ">f4", "d": ">f8", "q": ">i4", "Q": ">i8", "F": "S4", "c": "S1", "G": "S16", "U": "S16",
 }  # fmt: skip
-"""numpy's name of each type of GPMF."""
+"""numpy's name of each type of a value."""
 _TEXT_TYPES = ("F", "c", "G", "U")
 _FIXED_POINT = {"q": 2.0**-16, "Q": 2.0**-32}
 """Value of the last bit of each fixed-point type: the types are Q15.16 and Q31.32."""
@@ -102,18 +105,12 @@ class GpmfItem:
         expanded = _expanded_types(types) if self.kind == "?" else self._own_types()
         if not expanded or any(kind in _TEXT_TYPES for kind in expanded):
             return None
-        dtype = np.dtype([(f"f{index}", _DTYPES[kind]) for index, kind in enumerate(expanded)])
+        dtype = np.dtype([(f"f{index}", DTYPES[kind]) for index, kind in enumerate(expanded)])
         if dtype.itemsize > self.size:
             return None
-        dtype = np.dtype(
-            {
-                "names": list(dtype.names or ()),
-                "formats": [dtype[index] for index in range(len(expanded))],
-                "offsets": np.cumsum([0, *(dtype[i].itemsize for i in range(len(expanded) - 1))]).tolist(),
-                "itemsize": self.size,
-            }
-        )
-        rows = np.frombuffer(self.content, dtype=dtype, count=len(self.content) // self.size)
+        count = len(self.content) // self.size
+        samples = np.frombuffer(self.content, np.uint8, count * self.size).reshape(count, self.size)
+        rows = np.ascontiguousarray(samples[:, : dtype.itemsize]).view(dtype)[:, 0]
         out = np.empty((len(rows), len(expanded)))
         with np.errstate(invalid="ignore"):  # some NaN are reported when they are converted
             for index, kind in enumerate(expanded):
@@ -121,9 +118,9 @@ class GpmfItem:
         return out
 
     def _own_types(self) -> str:
-        if self.kind not in _DTYPES:
+        if self.kind not in DTYPES:
             return ""
-        columns, rest = divmod(self.size, np.dtype(_DTYPES[self.kind]).itemsize)
+        columns, rest = divmod(self.size, np.dtype(DTYPES[self.kind]).itemsize)
         return "" if rest else self.kind * columns
 
 
@@ -131,7 +128,7 @@ def _expanded_types(types: str) -> str:
     """Return the types of one sample with repetitions written out: ``f[3]B`` gives ``fffB``."""
     out = ""
     for kind, count in _REPEATED.findall(types.strip()):
-        if kind not in _DTYPES:
+        if kind not in DTYPES:
             return ""
         out += kind * int(count or 1)
         if len(out) > _MAX_COLUMNS:
@@ -139,19 +136,16 @@ def _expanded_types(types: str) -> str:
     return out
 
 
-@dataclass(slots=True)
-class Damage:
+class Damage(Counter[str]):
     """The kinds of damage that were found, in the order of the first occurrence, with their numbers."""
-
-    kinds: dict[str, int] = field(default_factory=dict)
 
     def add(self, kind: str) -> None:
         """Count one occurrence of a kind of damage."""
-        self.kinds[kind] = self.kinds.get(kind, 0) + 1
+        self[kind] += 1
 
     def notes(self) -> list[str]:
         """Return one sentence for each kind of damage."""
-        return [f"{kind} ({count} times)" if count > 1 else kind for kind, count in self.kinds.items()]
+        return [f"{kind} ({count} times)" if count > 1 else kind for kind, count in self.items()]
 
 
 def read_items(data: bytes, damage: Damage) -> tuple[GpmfItem, ...]:
@@ -222,12 +216,15 @@ def gopro_settings(path: Path) -> dict[str, str]:
     The settings are in the box ``moov/udta/GPMF`` of an MP4 file.
     """
     try:
-        with path.open("rb") as handle:
-            handle.seek(0, 2)
-            data = _BoxFinder(handle).find(0, handle.tell(), 0)
+        with path.open("rb") as stream:
+            found = _inner_boxes(stream, 0, stream.seek(0, 2), _MAX_BOX_DEPTH)
+            for kind, content, stop in itertools.islice(found, _MAX_BOXES):
+                if kind == _GOPRO_BOX and stop - content <= _MAX_BOX_BYTES:
+                    stream.seek(content)
+                    return dict(_text_items(read_items(stream.read(stop - content), Damage())))
     except OSError:
         return {}
-    return dict(_text_items(read_items(data, Damage()))) if data else {}
+    return {}
 
 
 def gopro_model(settings: Mapping[str, str], firmware: str, device: str) -> str:
@@ -262,37 +259,15 @@ def gopro_stabilisation(settings: Mapping[str, str]) -> str:
     return mode if mode.upper() not in (*_OFF, "Y") else "on"
 
 
-class _BoxFinder:
-    """Finds the box of the settings in an MP4 file."""
+def _inner_boxes(stream: BinaryIO, start: int, end: int, depth: int) -> Iterator[tuple[bytes, int, int]]:
+    """Yield the type, the start of the content and the end of the boxes between two positions.
 
-    def __init__(self, handle: BinaryIO) -> None:
-        self._handle = handle
-        self._left = _MAX_BOXES
-
-    def find(self, start: int, end: int, depth: int) -> bytes | None:
-        """Return the content of the first GPMF box between two offsets; None if there is no such box."""
-        while start + 8 <= end and self._left > 0:
-            self._left -= 1
-            self._handle.seek(start)
-            header = self._handle.read(16)
-            if len(header) < 8:
-                return None
-            size, kind = struct.unpack(">I4s", header[:8])
-            content = 8
-            if size == 1 and len(header) == 16:
-                size, content = struct.unpack(">Q", header[8:])[0], 16
-            size = end - start if size == 0 else size
-            if size < content:
-                return None
-            if kind == _GOPRO_BOX and size <= _MAX_BOX_BYTES:
-                self._handle.seek(start + content)
-                return self._handle.read(size - content)
-            if kind in _CONTAINER_BOXES and depth < _MAX_BOX_DEPTH:
-                found = self.find(start + content, min(start + size, end), depth + 1)
-                if found is not None:
-                    return found
-            start += size
-        return None
+    The boxes inside the boxes that lead to the settings are yielded too.
+    """
+    for kind, _, content, stop in boxes(stream, start, end):
+        yield kind, content, stop
+        if kind in _CONTAINER_BOXES and depth:
+            yield from _inner_boxes(stream, content, min(stop, end), depth - 1)
 
 
 def _text_items(items: tuple[GpmfItem, ...]) -> Iterator[tuple[str, str]]:

@@ -13,20 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bodycap_batch.formats.atomic_files import store_error_from_os_error
-
-_FORMATS = {
-    "b": "b",
-    "B": "B",
-    "s": "h",
-    "S": "H",
-    "l": "i",
-    "L": "I",
-    "j": "q",
-    "J": "Q",
-    "f": "f",
-    "d": "d",
-}
-"""Format of the module `struct` for each type of numbers."""
+from bodycap_batch.formats.gpmf import DTYPES
 
 
 def header(key: str, kind: int, size: int, count: int) -> bytes:
@@ -47,9 +34,8 @@ def item(key: str, kind: str, values: str | npt.ArrayLike, columns: int = 1) -> 
         content = str(values).encode("latin-1")
         size, count = 1, len(content)
     else:
-        flat = np.asarray(values).ravel().tolist()
-        content = struct.pack(f">{len(flat)}{_FORMATS[kind]}", *flat)
-        size, count = struct.calcsize(">" + _FORMATS[kind]) * columns, len(flat) // columns
+        flat = np.asarray(values).ravel().astype(DTYPES[kind])
+        content, size, count = flat.tobytes(), flat.itemsize * columns, len(flat) // columns
     return header(key, ord(kind), size, count) + content + b"\0" * (-len(content) % 4)
 
 

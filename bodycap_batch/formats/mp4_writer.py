@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -14,10 +16,13 @@ import numpy.typing as npt
 from bodycap_batch.core.errors import StoreError
 from bodycap_batch.formats.atomic_files import store_error_from_os_error
 from bodycap_batch.formats.file_url import file_url
-from bodycap_batch.formats.sound_frames import sound_frames
 
 if TYPE_CHECKING:
+    from av.audio.frame import AudioFrame
     from av.video.frame import VideoFrame
+
+_FRAME_SAMPLES = 1024
+"""Number of samples of a frame. Origin: the frames of AAC have this size."""
 
 TIME_BASE_HZ = 15360
 """Number of timestamp units per second. Derivation: the number is a multiple of the usual frame rates 24, 30,
@@ -117,7 +122,7 @@ class VideoWriter:
         self._path = path
         self._quality = quality
         rate = Fraction(fps).limit_denominator(100_000)
-        try:
+        with self._reported():
             self._container = av.open(file_url(path), "w", options=_CONTAINER_OPTIONS.get(quality, {}))
             self._stream = self._container.add_stream("libx264", rate=rate)
             self._sound_stream = sound and self._container.add_stream(
@@ -127,8 +132,6 @@ class VideoWriter:
                 self._data_stream = self._container.add_data_stream("bin_data")
                 self._data_stream.metadata["handler_name"] = data.handler
                 self._data_stream.time_base = Fraction(1, _DATA_HZ)
-        except (OSError, av.error.FFmpegError) as error:
-            raise self._failure(error) from error
         self._payloads = () if data is None else data.payloads
         self._sound = iter(()) if sound is None else sound_frames(sound.samples, sound.rate_hz)
         self._stream.width, self._stream.height = size
@@ -189,25 +192,25 @@ class VideoWriter:
             packet.stream, packet.time_base = self._data_stream, Fraction(1, _DATA_HZ)
             packet.pts = packet.dts = round(_DATA_HZ * time_s)
             packet.duration = round(_DATA_HZ * duration_s)
-            try:
+            with self._reported():
                 self._container.mux(packet)
-            except (OSError, self._av.error.FFmpegError) as error:
-                raise self._failure(error) from error
 
     def _send(self, stream: Any, frame: object) -> None:
-        try:
+        with self._reported():
             for packet in stream.encode(frame):
                 self._container.mux(packet)
-        except (OSError, self._av.error.FFmpegError) as error:
-            raise self._failure(error) from error
 
-    def _failure(self, error: Exception) -> StoreError:
+    @contextmanager
+    def _reported(self) -> Iterator[None]:
         """Convert an error of the encoder or of the disk to a `StoreError`."""
-        if isinstance(error, OSError):
-            return store_error_from_os_error(error, self._path)
-        return StoreError(
-            f"the video cannot be written: {error}", path=self._path, hint="check the disk for errors"
-        )
+        try:
+            yield
+        except OSError as error:
+            raise store_error_from_os_error(error, self._path) from error
+        except self._av.error.FFmpegError as error:
+            raise StoreError(
+                f"the video cannot be written: {error}", path=self._path, hint="check the disk for errors"
+            ) from error
 
     def __enter__(self) -> Self:
         return self
@@ -221,11 +224,8 @@ class VideoWriter:
             if self._sound_stream is not None:
                 self._send(self._sound_stream, None)
             self._send_data()
-        try:
+        with self._reported() if kind is None else suppress(OSError, self._av.error.FFmpegError):
             self._container.close()
-        except (OSError, self._av.error.FFmpegError) as problem:
-            if kind is None:
-                raise self._failure(problem) from problem
 
 
 def yuv420_from_rgb(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
@@ -252,3 +252,17 @@ def yuv420_from_rgb(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     for plane, chroma in zip(planes[height:].reshape(2, -1), (blue, red), strict=True):
         plane[:] = cv2.LUT(chroma, _STUDIO_RANGE_CHROMA).ravel()
     return np.asarray(planes)
+
+
+def sound_frames(
+    samples: npt.NDArray[np.float32], rate_hz: int, layout: str = "mono", start: int = 0
+) -> Iterator[AudioFrame]:
+    """Yield the frames of PyAV for samples (N,) or (channels,N); the first has the timestamp `start`."""
+    import av
+
+    planes = np.atleast_2d(samples)
+    for first in range(0, planes.shape[1], _FRAME_SAMPLES):
+        part = np.ascontiguousarray(planes[:, first : first + _FRAME_SAMPLES], np.float32)
+        frame = av.AudioFrame.from_ndarray(part, format="fltp", layout=layout)
+        frame.sample_rate, frame.pts, frame.time_base = rate_hz, start + first, Fraction(1, rate_hz)
+        yield frame

@@ -87,33 +87,21 @@ def read_tum(path: Path | str) -> TimedPoses:
 
 def _parse_line(path: Path, number: int, words: list[str]) -> tuple[int, list[float]]:
     """Return the time in nanoseconds and the seven numbers of the pose of one line."""
-    if len(words) != 8:
-        message = f"the line has {len(words)} columns, but must have 8"
-        raise JobError(message, path=path, line=number, hint=f"write one pose on each line: {_COLUMNS}")
+    time_ns, row = 0, [0.0]
+    problem, hint = "", f"write one pose on each line: {_COLUMNS}"
     try:
-        time_ns = nanoseconds(words[0])
-        row = [float(word) for word in words[1:]]
+        time_ns, row = nanoseconds(words[0]), [float(word) for word in words[1:]]
     except (ValueError, InvalidOperation, OverflowError):
-        raise JobError(
-            "the line contains a word that is not a number",
-            path=path,
-            line=number,
-            hint=f"write one pose on each line: {_COLUMNS}",
-        ) from None
-    if not np.isfinite(row).all() or abs(time_ns) >= 2**63:
-        raise JobError(
-            "the line contains NaN, infinity or a time out of range",
-            path=path,
-            line=number,
-            hint="leave out the lines of frames without a pose",
-        )
-    if np.linalg.norm(row[3:]) < 1e-6:
-        raise JobError(
-            "the quaternion is zero",
-            path=path,
-            line=number,
-            hint="write the quaternion in the order qx qy qz qw",
-        )
+        problem = "the line contains a word that is not a number"
+    if len(words) != 8:
+        problem = f"the line has {len(words)} columns, but must have 8"
+    elif not problem and (not np.isfinite(row).all() or abs(time_ns) >= 2**63):
+        problem = "the line contains NaN, infinity or a time out of range"
+        hint = "leave out the lines of frames without a pose"
+    elif not problem and np.linalg.norm(row[3:]) < 1e-6:
+        problem, hint = "the quaternion is zero", "write the quaternion in the order qx qy qz qw"
+    if problem:
+        raise JobError(problem, path=path, line=number, hint=hint)
     return time_ns, row
 
 

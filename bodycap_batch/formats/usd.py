@@ -10,6 +10,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError, StoreError
+from bodycap_batch.core.unique_names import unique_name
 from bodycap_batch.formats.atomic_files import atomic_replacement
 from bodycap_batch.formats.mannequin import Mannequin, make_mannequin
 from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, rotation_from_quat_xyzw
@@ -121,12 +122,8 @@ def _joint_tokens(skeleton: SkeletonModel) -> list[str]:
 
     out: list[str] = []
     for name, parent in zip(skeleton.joints, skeleton.parents.tolist(), strict=True):
-        base = Tf.MakeValidIdentifier(name)
         above = f"{out[parent]}/" if parent >= 0 else ""
-        token, number = f"{above}{base}", 2
-        while token in out:
-            token, number = f"{above}{base}_{number}", number + 1
-        out.append(token)
+        out.append(unique_name(f"{above}{Tf.MakeValidIdentifier(name)}", out))
     return out
 
 

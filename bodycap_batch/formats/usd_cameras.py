@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.unique_names import unique_name
 from bodycap_batch.formats.palette import linear_colours
 from bodycap_batch.formats.usd import export_stage, layer_data, new_stage
 from bodycap_batch.model.animated_camera import (
@@ -48,14 +49,10 @@ def write_camera_usd(path: Path, scene: CameraScene) -> Path:
     stage = new_stage(scene.take.fps, scene.frame_count)
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, _SCENE_PATH).GetPrim())
     stage.GetRootLayer().customLayerData = layer_data(scene.figures())
-    names: set[str] = {"Room"}
+    names = ["Room"]
     for camera in scene.cameras:
-        base = Tf.MakeValidIdentifier(camera.name)
-        name, number = base, 2
-        while name in names:
-            name, number = f"{base}_{number}", number + 1
-        names.add(name)
-        _define_camera(stage, f"{_SCENE_PATH}/{name}", camera)
+        names.append(unique_name(Tf.MakeValidIdentifier(camera.name), names))
+        _define_camera(stage, f"{_SCENE_PATH}/{names[-1]}", camera)
     if len(scene.points):
         _define_room(stage, scene)
     return export_stage(stage, path)

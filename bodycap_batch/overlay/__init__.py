@@ -1,7 +1,6 @@
 """Project the solved body and the map points into each camera's images, and draw them."""
 
-from bodycap_batch.overlay.bone_motion import BoneMotion, Bones, bones_from_motion
-from bodycap_batch.overlay.bone_projection import BoneLine, project_bones
+from bodycap_batch.overlay.bones import BoneLine, BoneMotion, Bones, bones_from_motion, project_bones
 from bodycap_batch.overlay.camera_views import CameraView, ObservedPoints, make_camera_views
 from bodycap_batch.overlay.drawing import Colour, RgbImage, draw_overlay
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX
-from bodycap_batch.overlay.bone_projection import BoneLine
+from bodycap_batch.overlay.bones import BoneLine
 from bodycap_batch.overlay.camera_views import ObservedPoints
 
 RgbImage = npt.NDArray[np.uint8]

@@ -61,9 +61,9 @@ def relate_gyro(camera: CaptureCamera, matches: FrameMatches, telemetry: CameraT
     if abs(compared.fit.focal_ratio - 1.0) > _MAX_FOCAL_CHANGE:
         reason = f"the focal length is wrong by a factor of {compared.fit.focal_ratio:.2f}"
         return RelatedGyro(rates=None, reason=reason)
-    if stated_s is None and camera.may_be_sideways:
-        return RelatedGyro(rates=_rates(gyro, compared.fit), reason=compared.reason)
-    better = fit_to_matches(rays, times_s, gyro, camera.camera, compared.fit, stated_s)
+    better = None
+    if stated_s is not None or not camera.may_be_sideways:
+        better = fit_to_matches(rays, times_s, gyro, camera.camera, compared.fit, stated_s)
     if better is None:
         return RelatedGyro(rates=_rates(gyro, compared.fit), reason=compared.reason)
     readout = (better.readout_s, better.readout_sigma_s)

@@ -93,34 +93,28 @@ def judge_rotations(
         focal_known: Whether the focal length behind the rotations is exact.
     """
     fit = fit_gyro(picture, gyro, axes_known=telemetry.axes_known, focal_known=focal_known)
+    verdict: Verdict = "unknown"
+    undone = None
     if fit is None:
         reason = "too few pictures with texture have samples of the gyroscope"
-        return PictureGyroComparison(verdict="unknown", reason=reason)
-    if _is_good(fit):
+    elif _is_good(fit):
+        verdict = "agrees"
         reason = f"pictures and gyroscope turn together (R² {fit.r_squared:.2f})"
-        return PictureGyroComparison(verdict="agrees", reason=reason, fit=fit)
-    if fit.gyro_shake_rad_s < _MIN_SHAKE_RAD_S:
-        return PictureGyroComparison(
-            verdict="unknown",
-            reason=f"the camera turns too little for a comparison ({fit.gyro_shake_rad_s:.3f} rad/s)",
-            fit=fit,
+    elif fit.gyro_shake_rad_s < _MIN_SHAKE_RAD_S:
+        reason = f"the camera turns too little for a comparison ({fit.gyro_shake_rad_s:.3f} rad/s)"
+    elif (share := fit.picture_shake_rad_s / fit.gyro_shake_rad_s) > _MAX_SHAKE_RATIO:
+        reason = (
+            f"pictures and gyroscope do not agree (R² {fit.r_squared:.2f}), although both turn: the "
+            "samples may belong to another video, or the pictures show too little of the room"
         )
-    share = fit.picture_shake_rad_s / fit.gyro_shake_rad_s
-    if share > _MAX_SHAKE_RATIO:
-        return PictureGyroComparison(
-            verdict="unknown",
-            reason=f"pictures and gyroscope do not agree (R² {fit.r_squared:.2f}), although both turn: the "
-            "samples may belong to another video, or the pictures show too little of the room",
-            fit=fit,
+    else:
+        verdict = "stabilised"
+        undone = _undone_fit(picture, gyro, telemetry, focal_known=focal_known)
+        reason = (
+            f"the camera stabilised the video: the pictures show {100 * share:.0f} % of the shaking that "
+            f"its gyroscope measured (R² {max(fit.r_squared, 0.0):.2f}); {_undo_text(undone)}"
         )
-    undone = _undone_fit(picture, gyro, telemetry, focal_known=focal_known)
-    return PictureGyroComparison(
-        verdict="stabilised",
-        reason=f"the camera stabilised the video: the pictures show {100 * share:.0f} % of the shaking that "
-        f"its gyroscope measured (R² {max(fit.r_squared, 0.0):.2f}); {_undo_text(undone)}",
-        fit=fit,
-        undone=undone,
-    )
+    return PictureGyroComparison(verdict=verdict, reason=reason, fit=fit, undone=undone)
 
 
 def _is_good(fit: GyroFit) -> bool:

@@ -25,7 +25,6 @@ from bodycap_batch.formats.gpmf import (
     gopro_stabilisation,
     read_items,
 )
-from bodycap_batch.telemetry.saturation import saturated_stretches
 from bodycap_batch.telemetry.stream_clock import MAX_SAMPLES, Payload, StreamClock, fit_stream_clock
 from bodycap_batch.telemetry.streams import (
     ACCELEROMETER,
@@ -39,6 +38,7 @@ from bodycap_batch.telemetry.streams import (
     CameraTelemetry,
     GpsTrack,
     Stream,
+    gaps_of,
 )
 
 _STREAMS = {
@@ -87,8 +87,6 @@ _OLD_AXES = (("FUSION", "yXZ"), ("HERO5", "ZXY"), ("HERO6", "YxZ"), ("HERO7", "Y
 is the negative axis. Source: GoPro's list of streams."""
 _ZXY_NAMES = ("(z,x,y)", "(up/down, right/left, forward/back)")
 """Ends of the names of streams that name the axes z, x, y, of files that name neither model nor axes."""
-_MAX_GAP_RATIO = 1.5
-"""Distance of two samples, as a multiple of the sample interval, above which there is a gap."""
 _MIN_IMU_PER_FRAME = 1.5
 """Minimum number of gyroscope samples per frame. With fewer samples, they are means over a timelapse
 interval.
@@ -477,14 +475,8 @@ def _stream(raw: _RawStream, clock: StreamClock, times_s: FloatArray, values: Fl
         times_s=times_s,
         values=values,
         rate_hz=clock.rate_hz,
-        gaps_s=(*gaps_of(times_s, clock.rate_hz), *saturated_stretches(raw.key, times_s, values)),
+        gaps_s=gaps_of(raw.key, times_s, values, clock.rate_hz),
     )
-
-
-def gaps_of(times_s: FloatArray, rate_hz: float) -> tuple[tuple[float, float], ...]:
-    """Return start and end (seconds) of each stretch between samples that is longer than an interval."""
-    wide = np.flatnonzero(np.diff(times_s) > _MAX_GAP_RATIO / rate_hz)
-    return tuple((float(times_s[index]), float(times_s[index + 1])) for index in wide)
 
 
 def _increasing(times_s: FloatArray) -> BoolArray:

@@ -32,10 +32,10 @@ _TRIMMED_RATIO = 0.1
 Evidence: none."""
 _ROUNDS = 4
 """Number of times that the pairs are selected for the first solution. Evidence: none."""
-_AXES_SIGMA_RAD = math.radians(10.0)
+AXES_SIGMA_RAD = math.radians(10.0)
 """Standard deviation (radians) of the rotation between a sensor and the lens, if the axes of the sensor are
 known. Origin: sensors are mounted to some degrees; the estimate must not depend on it where data decide."""
-_BIAS_SIGMA_RAD_S = 0.05
+BIAS_SIGMA_RAD_S = 0.05
 """Standard deviation (rad/s) of a gyroscope's bias. Origin: consumer sensors state up to 1 to 3 °/s."""
 _DRIFT_SIGMA = 1e-3
 """Standard deviation of the rate of the gyroscope's clock against that of the frames, no unit, after the rate
@@ -211,7 +211,7 @@ class _Problem:
             seen, turned = self._seen[kept], measured[kept]
             seen_mean, turned_mean = seen.mean(axis=0), turned.mean(axis=0)
             cross = (seen - seen_mean).T @ (turned - turned_mean)
-            prior = noise**2 / (ratio * _AXES_SIGMA_RAD**2) * np.eye(3) if self._axes_known else 0.0
+            prior = noise**2 / (ratio * AXES_SIGMA_RAD**2) * np.eye(3) if self._axes_known else 0.0
             rotation = nearest_rotation(cross + prior)
             energy = float(((turned - turned_mean) ** 2).sum())
             ratio = max(float((rotation * cross).sum()) / max(energy, 1e-12), 1e-3)
@@ -234,8 +234,8 @@ class _Problem:
         bias = turned[kept].mean(axis=0) - first.rotation.T @ self._seen[kept].mean(axis=0) / first.ratio
         prior = np.concatenate(
             [
-                np.full(3, 1.0 / _AXES_SIGMA_RAD if self._axes_known else 0.0),
-                np.full(3, 1.0 / _BIAS_SIGMA_RAD_S),
+                np.full(3, 1.0 / AXES_SIGMA_RAD if self._axes_known else 0.0),
+                np.full(3, 1.0 / BIAS_SIGMA_RAD_S),
                 [0.0, 1.0 / _DRIFT_SIGMA, 1.0 / self._log_ratio_sigma],
             ]
         )

@@ -23,7 +23,7 @@ from bodycap_batch.model.geometry import rotation_angle_rad, so3_exp
 from bodycap_batch.model.gyro_rates import GyroOrientation
 from bodycap_batch.model.optical_flow import pixel_scale
 from bodycap_batch.model.rotation_fit import MatchedRays
-from bodycap_batch.telemetry.gyro_fit import GyroFit
+from bodycap_batch.telemetry.gyro_fit import AXES_SIGMA_RAD, BIAS_SIGMA_RAD_S, GyroFit
 from bodycap_batch.telemetry.streams import Stream
 
 _SCALE_PX = 1.0
@@ -43,8 +43,6 @@ _STEP = 1e-4
 """Step of the unknowns for derivatives: radians, rad/s and seconds."""
 _CONVERGED = 1e-5
 """Largest change of an unknown at which the rounds end: radians, rad/s and seconds."""
-_AXES_SIGMA_RAD, _BIAS_SIGMA_RAD_S = math.radians(10.0), 0.05
-"""Standard deviations of rotation and bias before the fit; see the fit to rotations."""
 _BLOCKS = 8
 """Number of blocks of successive pairs that are left out one after another for the standard deviations."""
 _MODEL_SIGMA = (0.01, 0.01, 0.01, 0.01, 0.01, 0.01, 0.0003, 0.0003)
@@ -177,7 +175,7 @@ class _MatchProblem:
         Turn and bias have a prior at 0.
         """
         prior = np.zeros(8)
-        prior[_TURN], prior[_BIAS] = 1.0 / _AXES_SIGMA_RAD**2, 1.0 / _BIAS_SIGMA_RAD_S**2
+        prior[_TURN], prior[_BIAS] = 1.0 / AXES_SIGMA_RAD**2, 1.0 / BIAS_SIGMA_RAD_S**2
         x, information, gradient = x.copy(), np.zeros((1, 8, 8)), np.zeros((1, 8))
         for _ in range(_ROUNDS):
             information, gradient = self._normal_equations(x, free)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,8 +12,7 @@ import numpy as np
 from bodycap_batch.capture.timeline import ChapterClock, clock_of_chapter
 from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.core.arrays import IntArray
-from bodycap_batch.telemetry.gopro import gaps_of, read_gopro_file
-from bodycap_batch.telemetry.saturation import saturated_stretches
+from bodycap_batch.telemetry.gopro import read_gopro_file
 from bodycap_batch.telemetry.streams import (
     ACCELEROMETER,
     CAMERA_ORIENTATION,
@@ -22,6 +22,7 @@ from bodycap_batch.telemetry.streams import (
     CameraTelemetry,
     GpsTrack,
     Stream,
+    gaps_of,
 )
 from bodycap_batch.telemetry.text_files import read_imu_file
 
@@ -123,10 +124,9 @@ def _joined(chapters: Sequence[CameraTelemetry]) -> CameraTelemetry:
         return chapters[0]
     keys = dict.fromkeys(key for chapter in chapters for key in chapter.streams)
     is_timelapse = any(chapter.is_timelapse for chapter in chapters)
-    other: dict[str, int] = {}
+    other = Counter[str]()
     for chapter in chapters:
-        for name, count in chapter.other_streams.items():
-            other[name] = other.get(name, 0) + count
+        other.update(chapter.other_streams)
     found = next((chapter for chapter in chapters if chapter.source != "none"), chapters[0])
     return replace(
         found,
@@ -136,7 +136,7 @@ def _joined(chapters: Sequence[CameraTelemetry]) -> CameraTelemetry:
             if not is_timelapse or key not in (*_TURNED, "MAGN")
         },
         gps=_joined_gps([chapter.gps for chapter in chapters if chapter.gps is not None]),
-        other_streams=other,
+        other_streams=dict(other),
         axes_known=all(chapter.axes_known for chapter in chapters if chapter.source != "none"),
         is_timelapse=is_timelapse,
         notes=tuple(dict.fromkeys(note for chapter in chapters for note in chapter.notes)),
@@ -159,7 +159,7 @@ def _joined_stream(parts: Sequence[Stream]) -> Stream:
         times_s=times_s,
         values=joined,
         rate_hz=rate_hz,
-        gaps_s=(*gaps_of(times_s, rate_hz), *saturated_stretches(parts[0].key, times_s, joined)),
+        gaps_s=gaps_of(parts[0].key, times_s, joined, rate_hz),
     )
 
 

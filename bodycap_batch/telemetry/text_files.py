@@ -21,9 +21,14 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.core.text_encoding import decode_text
-from bodycap_batch.telemetry.gopro import gaps_of
-from bodycap_batch.telemetry.saturation import saturated_stretches
-from bodycap_batch.telemetry.streams import ACCELEROMETER, GYROSCOPE, CameraTelemetry, Stream, TelemetrySource
+from bodycap_batch.telemetry.streams import (
+    ACCELEROMETER,
+    GYROSCOPE,
+    CameraTelemetry,
+    Stream,
+    TelemetrySource,
+    gaps_of,
+)
 
 _TIME_UNITS_S = {"t": 1.0, "time": 1.0, "t_s": 1.0, "t_ms": 1e-3, "t_us": 1e-6, "t_ns": 1e-9}
 """Unit, seconds, of the first column, by its name. In a Gyroflow file, ``tscale`` gives it."""
@@ -339,9 +344,6 @@ def _telemetry(table: FloatArray, source: TelemetrySource, notes: Sequence[str])
                 times_s=times_s,
                 values=table[:, start : start + 3],
                 rate_hz=rate_hz,
-                gaps_s=(
-                    *gaps_of(times_s, rate_hz),
-                    *saturated_stretches(key, times_s, table[:, start : start + 3]),
-                ),
+                gaps_s=gaps_of(key, times_s, table[:, start : start + 3], rate_hz),
             )
     return CameraTelemetry(source=source, streams=streams, notes=tuple(notes))

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.clocks import estimate_clocks
-from bodycap_batch.clocks.joint_offsets import solve_clocks
+from bodycap_batch.clocks.joint_offsets import WAY_SIGMA_S, solve_clocks
 from bodycap_batch.clocks.pair_offsets import measure_pair
 from bodycap_batch.clocks.sound_track import RATE_HZ, SoundPiece, SoundTrack, read_sound_file
 from bodycap_batch.config.job import load_job
@@ -153,7 +153,8 @@ def measured(case: Case, tracks: Sequence[SoundTrack], offset_s: float) -> Outco
     pair = measure_pair(tracks[0], tracks[1])
     clock = None
     if pair.accepted:
-        clock = solve_clocks("0", [pair], {track.camera: track.start_s for track in tracks}).clocks["1"]
+        starts_s = {track.camera: track.start_s for track in tracks}
+        clock = solve_clocks("0", [pair], starts_s, dict.fromkeys(starts_s, WAY_SIGMA_S)).clocks["1"]
     nan = float("nan")
     return Outcome(
         case=case,

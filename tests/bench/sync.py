@@ -20,7 +20,7 @@ from pathlib import Path
 import av
 import numpy as np
 
-from bodycap_batch.formats.sound_frames import sound_frames
+from bodycap_batch.formats.mp4_writer import sound_frames
 from bodycap_batch.synthetic.sound import Microphone, Samples, make_scene, record
 from tests.bench.rows import BODYCAP, REPOSITORY
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bodycap_batch.camera_places import TimedPoses, find_places, find_places_with
-from bodycap_batch.clocks.registered_paths import clocks_from_paths
+from bodycap_batch.clocks.motion_offsets import clocks_from_paths
 from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.model.geometry import Similarity, make_transform
 from bodycap_batch.model.scene import FrameStatus, Trajectory

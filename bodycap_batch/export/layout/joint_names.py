@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from importlib import resources
@@ -10,7 +11,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.unique_names import unique_name
 from bodycap_batch.model.geometry import quat_xyzw_from_rotation, so3_exp
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
 from bodycap_batch.model.skeleton_presets import split_side
@@ -60,11 +62,8 @@ def rename_roles(motion: Motion, preset: str) -> Motion:
     used = {_name_of_role(role, chosen) for role in skeleton.roles if role}
     joints: list[str] = []
     for name, role in zip(skeleton.joints, skeleton.roles, strict=True):
-        unique, number = (_name_of_role(role, chosen), 2) if role else (name, 2)
-        while not role and unique in used:
-            unique, number = f"{name}_{number}", number + 1
-        used.add(unique)
-        joints.append(unique)
+        joints.append(_name_of_role(role, chosen) if role else unique_name(name, used))
+        used.add(joints[-1])
     return replace(motion, skeleton=replace(skeleton, joints=tuple(joints)))
 
 
@@ -76,19 +75,10 @@ def _name_of_role(role: str, chosen: dict[str, Any]) -> str:
         chosen: The settings of the naming preset.
     """
     trunk = {"Spine": chosen["spine"][0], "Spine1": chosen["spine"][-1], "Neck": chosen["neck"][0]}
-    return str(chosen.get("prefix", "")) + (trunk.get(role) or _joint_name(role, chosen))
-
-
-def _joint_name(role: str, chosen: dict[str, Any]) -> str:
-    """Return the joint name that a preset gives to a role.
-
-    Args:
-        role: The role of the joint.
-        chosen: The settings of the naming preset.
-    """
     side, part = split_side(role)
-    name = chosen.get("names", {}).get(part, part)
-    return f"{name}{chosen['sides'][side]}" if side and "sides" in chosen else f"{side}{name}"
+    name = trunk.get(role) or chosen.get("names", {}).get(part, part)
+    sided = f"{name}{chosen['sides'][side]}" if side and "sides" in chosen else f"{side}{name}"
+    return str(chosen.get("prefix", "")) + sided
 
 
 def _insert_joints(motion: Motion, lower: str, upper: str, names: list[str]) -> Motion:
@@ -136,19 +126,34 @@ def _skeleton_with_joints(skeleton: SkeletonModel, end: int, names: list[str]) -
     shifted = np.where(skeleton.parents >= end, skeleton.parents + count, skeleton.parents)
     chain = [int(skeleton.parents[end]), *range(end, end + count)]
     shifted[end] = chain[-1]
-    parents = np.concatenate([shifted[:end], chain[:-1], shifted[end:]])
     bones = np.array(skeleton.offsets_m)
     bones[end] /= count + 1
-    tpose = skeleton.tpose_rotation
+    parents = np.concatenate([shifted[:end], chain[:-1], shifted[end:]])
+    return insert_joints(skeleton, end, names, parents, np.insert(bones, [end] * count, bones[end], axis=0))
+
+
+def insert_joints(
+    skeleton: SkeletonModel, at: int, names: Sequence[str], parents: IntArray, offsets_m: FloatArray
+) -> SkeletonModel:
+    """Return the skeleton with new joints, which have no role, no end and no rotation in the T-pose.
+
+    Args:
+        skeleton: The skeleton with J joints.
+        at: Index of the first new joint.
+        names: (K,) names of the new joints.
+        parents: (J+K,) index of the parent of each joint.
+        offsets_m: (J+K,3) joint centres in the frames of the parents, metres.
+    """
+    places, tpose = [at] * len(names), skeleton.tpose_rotation
     return SkeletonModel(
         name=skeleton.name,
-        joints=(*skeleton.joints[:end], *names, *skeleton.joints[end:]),
+        joints=(*skeleton.joints[:at], *names, *skeleton.joints[at:]),
         parents=parents,
-        offsets_m=np.insert(bones, [end] * count, bones[end], axis=0),
-        end_offsets_m=np.insert(skeleton.end_offsets_m, [end] * count, np.nan, axis=0),
-        roles=(*skeleton.roles[:end], *("",) * count, *skeleton.roles[end:]),
-        bvh_channels=(*skeleton.bvh_channels[:end], *((),) * count, *skeleton.bvh_channels[end:]),
-        tpose_rotation=None if tpose is None else np.insert(tpose, [end] * count, np.eye(3), axis=0),
+        offsets_m=offsets_m,
+        end_offsets_m=np.insert(skeleton.end_offsets_m, places, np.nan, axis=0),
+        roles=(*skeleton.roles[:at], *("" for _ in names), *skeleton.roles[at:]),
+        bvh_channels=(*skeleton.bvh_channels[:at], *(() for _ in names), *skeleton.bvh_channels[at:]),
+        tpose_rotation=None if tpose is None else np.insert(tpose, places, np.eye(3), axis=0),
     )
 
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from bodycap_batch.config.options import RootMode
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.export.layout.joint_names import naming_preset
+from bodycap_batch.core.unique_names import unique_name
+from bodycap_batch.export.layout.joint_names import insert_joints, naming_preset
 from bodycap_batch.model.geometry import quat_xyzw_from_rotation, so3_exp
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
 
@@ -141,19 +142,7 @@ def _skeleton_with_floor_root(skeleton: SkeletonModel, name: str) -> SkeletonMod
         skeleton: The skeleton, with the hips as its root.
         name: Name of the new root joint. A number is appended if a joint already has this name.
     """
-    unique_name, number = name, 2
-    while unique_name in skeleton.joints:
-        unique_name, number = f"{name}{number}", number + 1
     offsets = np.concatenate([np.zeros((1, 3)), skeleton.offsets_m])
     offsets[1] = [0.0, -_HIPS_OFFSET_M, rest_pose(skeleton)[0, 2, 3]]
-    tpose = skeleton.tpose_rotation
-    return SkeletonModel(
-        name=skeleton.name,
-        joints=(unique_name, *skeleton.joints),
-        parents=np.concatenate([[-1], skeleton.parents + 1]),
-        offsets_m=offsets,
-        end_offsets_m=np.concatenate([np.full((1, 3), np.nan), skeleton.end_offsets_m]),
-        roles=("", *skeleton.roles),
-        bvh_channels=((), *skeleton.bvh_channels),
-        tpose_rotation=None if tpose is None else np.concatenate([np.eye(3)[None], tpose]),
-    )
+    parents = np.concatenate([[-1], skeleton.parents + 1])
+    return insert_joints(skeleton, 0, [unique_name(name, skeleton.joints, "")], parents, offsets)

@@ -11,15 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import bodycap_batch
-from bodycap_batch.core.errors import StoreError
 from bodycap_batch.formats.atomic_files import atomic_replacement, write_text
 from bodycap_batch.formats.blender.scene_script import SCENE_FILE, SCRIPT_FILE
 from bodycap_batch.formats.fbx.blender_process import run_script
 
 EXTENSION_FILE = "bodycap_blender.zip"
 _SCRIPT = Path(__file__).with_name("scene_script.py")
-_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
-"""Time of the files in the extension: the earliest of the ZIP format, so that equal runs give equal files."""
 
 _MANIFEST = """\
 schema_version = "1.0.0"
@@ -62,7 +59,8 @@ def _extension(script: str) -> bytes:
     manifest = _MANIFEST.format(version=bodycap_batch.__version__)
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, text in (("blender_manifest.toml", manifest), ("__init__.py", script)):
-            archive.writestr(zipfile.ZipInfo(name, _ZIP_TIME), text, zipfile.ZIP_DEFLATED)
+            # The time of a ZipInfo is a constant, so that equal runs give equal files.
+            archive.writestr(zipfile.ZipInfo(name), text, zipfile.ZIP_DEFLATED)
     return stream.getvalue()
 
 
@@ -81,12 +79,7 @@ def write_blend(path: Path) -> Path:
     """
     with tempfile.TemporaryDirectory() as folder:
         temporary = Path(folder) / path.name
-        done = run_script(path.parent / SCRIPT_FILE, ["--save", str(temporary)])
-        if done.returncode != 0 or not temporary.is_file():
-            last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
-            raise StoreError(
-                f"Blender could not write the file: {last}", path=path, hint="check the disk for errors"
-            )
+        run_script(path.parent / SCRIPT_FILE, ["--save", str(temporary)], made=temporary, path=path)
         with atomic_replacement(path) as target:
             target.write_bytes(temporary.read_bytes())
     return path

@@ -13,6 +13,7 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.core.text_encoding import encoding_of
+from bodycap_batch.core.unique_names import unique_name
 
 _CHANNELS = {name.lower(): name for axis in "XYZ" for name in (f"{axis}position", f"{axis}rotation")}
 """Channel names as the BVH specification spells them. The keys are the same names in lower case."""
@@ -187,7 +188,8 @@ def _read_statement(
         if len(joints) >= _MAX_JOINTS:
             raise lines.error(f"the file has more than {_MAX_JOINTS} joints")
         parent = -1 if inside is None else inside
-        joints.append(FileJoint(_unique_name(rest or f"joint{len(joints)}", joints), parent, lines.number))
+        name = unique_name(rest or f"joint{len(joints)}", {joint.name for joint in joints})
+        joints.append(FileJoint(name, parent, lines.number))
         if parent >= 0:
             joints[parent].children += 1
         opening.append(len(joints) - 1)
@@ -236,15 +238,6 @@ def _read_channels(lines: _LineReader, rest: str) -> tuple[str, ...]:
     if len(set(positions)) != len(positions):
         raise lines.error("one joint has the same position channel twice")
     return channels
-
-
-def _unique_name(name: str, joints: list[FileJoint]) -> str:
-    """Return `name`, with a number appended if an earlier joint already has this name."""
-    taken = {joint.name for joint in joints}
-    free, number = name, 2
-    while free in taken:
-        free, number = f"{name}_{number}", number + 1
-    return free
 
 
 def _check_joints(lines: _LineReader, joints: list[FileJoint]) -> None:

@@ -12,14 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.formats.bvh.axes import (
-    UNITS_PER_METRE,
-    world_from_file_points,
-    world_from_file_rotations,
-)
+from bodycap_batch.formats.bvh.axes import UNITS_PER_METRE, world_from_file_points
 from bodycap_batch.formats.bvh.euler import rotation_from_angles
 from bodycap_batch.formats.bvh.parser import FileJoint, parse_bvh
 from bodycap_batch.formats.bvh.roles import assign_roles
+from bodycap_batch.formats.y_up import WORLD_FROM_Y_UP, in_other_axes
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
 from bodycap_batch.model.skeleton_presets import rest_positions, stature_from_limbs
 
@@ -95,7 +92,7 @@ def read_bvh(path: Path | str, *, units: str = "auto") -> tuple[SkeletonModel, M
         fps=rate_from_frame_time(text.frame_time),
         start_ns=0,
         root_in_world_m=root,
-        local_rotation=world_from_file_rotations(_rotations(joints, values)),
+        local_rotation=in_other_axes(WORLD_FROM_Y_UP, _rotations(joints, values)),
         observed=np.ones((len(values), len(joints)), dtype=bool),
         hips_in_root_m=hips,
     )

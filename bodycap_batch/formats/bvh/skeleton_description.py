@@ -76,7 +76,7 @@ def describe_joints(skeleton: SkeletonModel) -> tuple[JointDescription, ...]:
                 role=role,
                 parent=skeleton.joints[parent] if parent >= 0 else "",
                 bone_m=length,
-                points=describe_direction(bone) if length > _MIN_BONE_M else "",
+                points=describe_direction(bone),
                 note=note,
             )
         )
@@ -111,9 +111,12 @@ def describe_direction(vector: FloatArray) -> str:
     direction, and the last word is the direction of the deviation.
 
     Args:
-        vector: (3,) direction in world axes, of any length except zero.
+        vector: (3,) direction in world axes, of any length; "" for a vector without length.
     """
-    unit = vector / np.linalg.norm(vector)
+    length = np.linalg.norm(vector)
+    if length <= _MIN_BONE_M:
+        return ""
+    unit = vector / length
     ranked = sorted(_DIRECTIONS, key=lambda word: -float(unit @ np.array(_DIRECTIONS[word])))
     nearest = unit @ np.array(_DIRECTIONS[ranked[0]])
     angle_deg = float(np.degrees(np.arccos(np.clip(nearest, -1.0, 1.0))))
@@ -128,7 +131,7 @@ def describe_arm_pose(skeleton: SkeletonModel) -> str:
     for side in ("Left", "Right"):
         joint = skeleton.index_of_role(f"{side}Arm")
         if joint is not None:
-            arms.append((side.lower(), _describe_direction_or_empty(_bone_vector(skeleton, rest, joint))))
+            arms.append((side.lower(), describe_direction(_bone_vector(skeleton, rest, joint))))
     if not arms:
         return "no joints of the arms were found"
     if all(word.split(",")[0] == side for side, word in arms):
@@ -136,8 +139,3 @@ def describe_arm_pose(skeleton: SkeletonModel) -> str:
     if all(word.split(",")[0] == "down" for _, word in arms):
         return "arms hanging"
     return "; ".join(f"{side} arm {word or 'without length'}" for side, word in arms)
-
-
-def _describe_direction_or_empty(vector: FloatArray) -> str:
-    """Describe the direction of a vector in words; return "" for a vector without length."""
-    return describe_direction(vector) if np.linalg.norm(vector) > _MIN_BONE_M else ""

@@ -8,8 +8,9 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.atomic_files import atomic_replacement
-from bodycap_batch.formats.bvh.axes import file_from_world_points, file_from_world_rotations
+from bodycap_batch.formats.bvh.axes import file_from_world_points
 from bodycap_batch.formats.bvh.euler import continuous_angles
+from bodycap_batch.formats.y_up import Y_UP_FROM_WORLD, in_other_axes
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
 
 _POSITION_CHANNELS = ("Xposition", "Yposition", "Zposition")
@@ -87,7 +88,8 @@ def _frame_values(
         units: Unit of length of the file.
     """
     orders = tuple("".join(name[0] for name in names if name.endswith("rotation")) for names in channels)
-    angles = np.rad2deg(continuous_angles(orders, file_from_world_rotations(motion.local_rotation)))
+    rotation = in_other_axes(Y_UP_FROM_WORLD, motion.local_rotation)
+    angles = np.rad2deg(continuous_angles(orders, rotation))
     position = file_from_world_points(motion.local_position_m(), units)
     columns = []
     for joint in order:

@@ -4,7 +4,6 @@ Blender writes the files in a separate process.
 """
 
 from bodycap_batch.formats.fbx.blender_process import find_blender, require_blender
-from bodycap_batch.formats.fbx.cameras import write_cameras_with_blender
-from bodycap_batch.formats.fbx.writer import write_fbx
+from bodycap_batch.formats.fbx.writer import write_cameras_with_blender, write_fbx
 
 __all__ = ["find_blender", "require_blender", "write_cameras_with_blender", "write_fbx"]

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from bodycap_batch.core.errors import JobError
+from bodycap_batch.core.errors import JobError, StoreError
 
 BLENDER_VARIABLE = "BODYCAP_BLENDER"
 """Name of the environment variable for the path of Blender, or of a Python that has the module ``bpy``."""
@@ -66,27 +66,39 @@ def require_blender() -> Path:
     script = ["--python-expr", _START_TEST] if is_blender_executable(blender) else ["-c", _START_TEST]
     done = _run([str(blender), *_flags(blender), *script])
     if done.returncode != 0:
-        last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
-        raise JobError(f"Blender cannot be used: {last}", path=blender, hint=_HINT)
+        raise JobError(f"Blender cannot be used: {_last_line(done)}", path=blender, hint=_HINT)
     return blender
 
 
-def run_script(script: Path, arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    """Run a Python file in Blender.
+def run_script(script: Path, arguments: Sequence[str], *, made: Path, path: Path) -> None:
+    """Run a Python file in Blender, which writes a file.
 
     Python's hash seed is constant, so that every run writes the same bytes.
 
     Args:
         script: Path of the Python file.
         arguments: Command-line arguments of the Python file.
+        made: Path of the file that the script must write.
+        path: Path of the result, for the error.
 
-    Returns:
-        The finished process, with its output.
+    Raises:
+        JobError: Blender was not found.
+        StoreError: The script failed, or did not write its file.
     """
     blender = find_blender()
-    if is_blender_executable(blender):
-        return _run([str(blender), *_flags(blender), "--python", str(script), "--", *arguments])
-    return _run([str(blender), *_flags(blender), str(script), *arguments])
+    call = ["--python", str(script), "--"] if is_blender_executable(blender) else [str(script)]
+    done = _run([str(blender), *_flags(blender), *call, *arguments])
+    if done.returncode != 0 or not made.is_file():
+        raise StoreError(
+            f"Blender could not write the file: {_last_line(done)}",
+            path=path,
+            hint="check the disk for errors",
+        )
+
+
+def _last_line(done: subprocess.CompletedProcess[str]) -> str:
+    """Return the last line of the errors of a finished process; its exit code without errors."""
+    return (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
 
 
 def is_blender_executable(blender: Path) -> bool:

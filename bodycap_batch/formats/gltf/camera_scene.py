@@ -5,18 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.formats.atomic_files import atomic_replacement
-from bodycap_batch.formats.gltf.axes import ARRAY_BUFFER, FILE_FROM_WORLD
-from bodycap_batch.formats.gltf.binary_buffer import BinaryBuffer
-from bodycap_batch.formats.gltf.reader import read_accessor
+from bodycap_batch.formats.gltf.binary_buffer import ARRAY_BUFFER, BinaryBuffer, read_accessor
 from bodycap_batch.formats.palette import linear_colours
+from bodycap_batch.formats.y_up import Y_UP_FROM_WORLD, camera_poses_with_y_up, poses_from_y_up
 from bodycap_batch.model.animated_camera import NEAR_PLANE, AnimatedCamera, CameraScene
 from bodycap_batch.model.geometry import (
     continuous_quat_xyzw,
-    make_transform,
     quat_xyzw_from_rotation,
     rotation_from_quat_xyzw,
 )
@@ -49,15 +44,14 @@ def write_camera_glb(path: Path, scene: CameraScene) -> Path:
     meshes = []
     if len(scene.points):
         attributes = gl.Attributes(
-            POSITION=buffer.add(scene.points @ FILE_FROM_WORLD.T, "VEC3", target=ARRAY_BUFFER),
+            POSITION=buffer.add(scene.points @ Y_UP_FROM_WORLD.T, "VEC3", target=ARRAY_BUFFER),
             COLOR_0=buffer.add(linear_colours(scene.colors), "VEC3", target=ARRAY_BUFFER),
         )
         meshes = [gl.Mesh(name="Room", primitives=[gl.Primitive(attributes=attributes, mode=_POINTS)])]
     top = list(range(count + len(meshes)))
     animation = _camera_animation(scene, buffer)
-    document = gl.GLTF2(
-        asset=gl.Asset(version="2.0", generator="bodycap_batch"),
-        scene=0,
+    buffer.save(
+        path,
         scenes=[gl.Scene(nodes=top)],
         nodes=[
             *(_camera_node(camera, index) for index, camera in enumerate(cameras)),
@@ -77,27 +71,16 @@ def write_camera_glb(path: Path, scene: CameraScene) -> Path:
         ],
         meshes=meshes,
         animations=[animation],
-        accessors=buffer.accessors,
-        bufferViews=buffer.views,
-        buffers=[gl.Buffer(byteLength=len(buffer.data))],
         extras=scene.figures(),
     )
-    document.set_binary_blob(bytes(buffer.data))
-    with atomic_replacement(path) as temporary:
-        document.save_binary(str(temporary))
     return path
-
-
-def _poses_in_file(camera: AnimatedCamera) -> FloatArray:
-    """Return the poses (T,4,4) of a camera in the axes of the file."""
-    return make_transform(FILE_FROM_WORLD, np.zeros(3)) @ camera.scene_from_gl()
 
 
 def _camera_node(camera: AnimatedCamera, index: int) -> Any:
     """Return the node of a camera, with its pose at the first frame."""
     import pygltflib as gl
 
-    first = _poses_in_file(camera)[0]
+    first = camera_poses_with_y_up(camera)[0]
     return gl.Node(
         name=camera.name,
         camera=index,
@@ -109,24 +92,12 @@ def _camera_node(camera: AnimatedCamera, index: int) -> Any:
 
 def _camera_animation(scene: CameraScene, buffer: BinaryBuffer) -> Any:
     """Return the animation of all cameras."""
-    import pygltflib as gl
-
-    times = buffer.add(np.arange(scene.frame_count) / scene.take.fps, "SCALAR")
     curves = []
     for node, camera in enumerate(scene.cameras):
-        poses = _poses_in_file(camera)
-        curves += [
-            (node, "rotation", buffer.add(continuous_quat_xyzw(poses[:, :3, :3]), "VEC4")),
-            (node, "translation", buffer.add(poses[:, :3, 3], "VEC3")),
-        ]
-    return gl.Animation(
-        name=scene.take.name or "Cameras",
-        samplers=[gl.AnimationSampler(input=times, output=out, interpolation="LINEAR") for *_, out in curves],
-        channels=[
-            gl.AnimationChannel(sampler=index, target=gl.AnimationChannelTarget(node=node, path=path))
-            for index, (node, path, _) in enumerate(curves)
-        ],
-    )
+        poses = camera_poses_with_y_up(camera)
+        curves.append((node, "rotation", continuous_quat_xyzw(poses[:, :3, :3])))
+        curves.append((node, "translation", poses[:, :3, 3]))
+    return buffer.animation(scene.take.name or "Cameras", scene.take.fps, curves)
 
 
 def read_camera_glb(path: Path) -> dict[str, tuple[float, FloatArray]]:
@@ -148,9 +119,6 @@ def read_camera_glb(path: Path) -> dict[str, tuple[float, FloatArray]]:
     out = {}
     for number, curves in found.items():
         node = document.nodes[number]
-        poses = make_transform(
-            FILE_FROM_WORLD.T @ rotation_from_quat_xyzw(curves["rotation"]),
-            curves["translation"] @ FILE_FROM_WORLD,
-        )
+        poses = poses_from_y_up(rotation_from_quat_xyzw(curves["rotation"]), curves["translation"])
         out[node.name] = (float(document.cameras[node.camera].perspective.yfov), poses)
     return out

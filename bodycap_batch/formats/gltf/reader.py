@@ -10,12 +10,8 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.formats.gltf.axes import (
-    COMPONENT_DTYPES,
-    ELEMENT_WIDTHS,
-    FILE_FROM_WORLD,
-    rotations_in_world_axes,
-)
+from bodycap_batch.formats.gltf.binary_buffer import read_accessor
+from bodycap_batch.formats.y_up import WORLD_FROM_Y_UP, Y_UP_FROM_WORLD, in_other_axes
 from bodycap_batch.model.geometry import rotation_from_quat_xyzw
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
 
@@ -61,9 +57,9 @@ def _read_motion(document: Any, name: str) -> Motion:
         values = read_accessor(document, animation.samplers[channel.sampler].output)
         joint = joint_of_node[channel.target.node]
         if channel.target.path == "rotation":
-            local[:, joint] = rotations_in_world_axes(rotation_from_quat_xyzw(values))
+            local[:, joint] = in_other_axes(WORLD_FROM_Y_UP, rotation_from_quat_xyzw(values))
         else:
-            position[joint] = values @ FILE_FROM_WORLD
+            position[joint] = values @ Y_UP_FROM_WORLD
     return Motion(
         skeleton=skeleton,
         fps=float(document.extras["fps"]),
@@ -88,7 +84,7 @@ def _read_skeleton(document: Any, name: str, joint_of_node: dict[int, int]) -> S
     for joint, node in enumerate(nodes):
         for child in node.children or ():
             parents[joint_of_node[child]] = joint
-    offsets = np.array([node.translation for node in nodes]) @ FILE_FROM_WORLD
+    offsets = np.array([node.translation for node in nodes]) @ Y_UP_FROM_WORLD
     rest = rotation_from_quat_xyzw([node.rotation for node in nodes])
     return SkeletonModel(
         name=name,
@@ -98,18 +94,5 @@ def _read_skeleton(document: Any, name: str, joint_of_node: dict[int, int]) -> S
         end_offsets_m=np.full((len(nodes), 3), np.nan),
         roles=tuple((node.extras or {}).get("role", "") for node in nodes),
         bvh_channels=((),) * len(nodes),
-        tpose_rotation=rotations_in_world_axes(rest),
+        tpose_rotation=in_other_axes(WORLD_FROM_Y_UP, rest),
     )
-
-
-def read_accessor(document: Any, accessor: int) -> FloatArray:
-    """Return the values (N, number of components) of the accessor with this index."""
-    entry = document.accessors[accessor]
-    view = document.bufferViews[entry.bufferView]
-    values = np.frombuffer(
-        document.binary_blob(),
-        dtype=COMPONENT_DTYPES[entry.componentType],
-        count=entry.count * ELEMENT_WIDTHS[entry.type],
-        offset=view.byteOffset + entry.byteOffset,
-    )
-    return np.asarray(values.reshape(entry.count, ELEMENT_WIDTHS[entry.type]), dtype=np.float64)

@@ -9,17 +9,15 @@ from typing import Any
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, json_numbers, true_spans
-from bodycap_batch.formats.atomic_files import atomic_replacement
-from bodycap_batch.formats.gltf.axes import (
+from bodycap_batch.formats.gltf.binary_buffer import (
     ARRAY_BUFFER,
     ELEMENT_ARRAY_BUFFER,
-    FILE_FROM_WORLD,
     UINT16,
     UINT32,
-    poses_in_file_axes,
+    BinaryBuffer,
 )
-from bodycap_batch.formats.gltf.binary_buffer import BinaryBuffer
 from bodycap_batch.formats.mannequin import make_mannequin
+from bodycap_batch.formats.y_up import Y_UP_FROM_WORLD, in_other_axes
 from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, make_transform, quat_xyzw_from_rotation
 from bodycap_batch.model.measured_parts import JointSource, joint_sources
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
@@ -68,26 +66,18 @@ def write_glb(
     body = _body_primitive(motion.skeleton, turn, buffer)
     name = "Motion" if take is None or not take.name else take.name
     animation = _motion_animation(motion, turn, buffer, name)
-    rest = turn @ poses_in_file_axes(rest_pose(motion.skeleton))
+    rest = turn @ _poses_in_file_axes(rest_pose(motion.skeleton))
     binds = buffer.add(np.swapaxes(invert(rest), -1, -2).reshape(-1, 16), "MAT4")
     joints = len(motion.skeleton.joints)
-    document = gl.GLTF2(
-        asset=gl.Asset(version="2.0", generator="bodycap_batch"),
-        scene=0,
+    buffer.save(
+        Path(path),
         scenes=[gl.Scene(nodes=[joints + 1])],
         nodes=[
             *_joint_nodes(motion, rest, sigma_m),
             gl.Node(name="Mannequin", mesh=0, skin=0),
             gl.Node(name="Armature", children=[0, joints]),
         ],
-        skins=[
-            gl.Skin(
-                name="Armature",
-                joints=list(range(joints)),
-                skeleton=0,
-                inverseBindMatrices=binds,
-            )
-        ],
+        skins=[gl.Skin(name="Armature", joints=list(range(joints)), skeleton=0, inverseBindMatrices=binds)],
         meshes=[gl.Mesh(name="Mannequin", primitives=[body])],
         materials=[
             gl.Material(
@@ -98,9 +88,6 @@ def write_glb(
             )
         ],
         animations=[animation],
-        accessors=buffer.accessors,
-        bufferViews=buffer.views,
-        buffers=[gl.Buffer(byteLength=len(buffer.data))],
         extras={
             "fps": motion.fps,
             "start_s": motion.start_ns / 1e9,
@@ -108,9 +95,12 @@ def write_glb(
             **({} if earth is None else {"earth": dict(earth)}),
         },
     )
-    document.set_binary_blob(bytes(buffer.data))
-    with atomic_replacement(Path(path)) as temporary:
-        document.save_binary(str(temporary))
+
+
+def _poses_in_file_axes(world_from_joint: FloatArray) -> FloatArray:
+    """Convert poses (...,4,4) from world axes to file axes. The axes of the joint are converted too."""
+    rotation = in_other_axes(Y_UP_FROM_WORLD, world_from_joint[..., :3, :3])
+    return make_transform(rotation, world_from_joint[..., :3, 3] @ Y_UP_FROM_WORLD.T)
 
 
 def _joint_nodes(motion: Motion, rest: FloatArray, sigma_m: FloatArray | None) -> list[Any]:
@@ -169,7 +159,7 @@ def _body_primitive(skeleton: SkeletonModel, turn: FloatArray, buffer: BinaryBuf
     import pygltflib as gl
 
     body = make_mannequin(skeleton)
-    axes = (turn[:3, :3] @ FILE_FROM_WORLD).T
+    axes = (turn[:3, :3] @ Y_UP_FROM_WORLD).T
     joints, weights = np.zeros((2, len(body.vertices_m), 4))
     weights[:, :2] = body.weights
     joints[:, :2] = np.where(body.weights > 0.0, body.joints, 0)  # the joint of a zero weight must be 0
@@ -198,23 +188,11 @@ def _motion_animation(motion: Motion, turn: FloatArray, buffer: BinaryBuffer, na
         buffer: The buffer to which the arrays are appended.
         name: Name of the animation.
     """
-    import pygltflib as gl
-
-    times = buffer.add(np.arange(len(motion.root_in_world_m)) / motion.fps, "SCALAR")
     local = make_transform(motion.local_rotation, motion.local_position_m())
-    local = poses_in_file_axes(local)
+    local = _poses_in_file_axes(local)
     local[:, 0] = turn @ local[:, 0]
     quats, position = continuous_quat_xyzw(local[..., :3, :3]), local[..., :3, 3]
-    curves = [(joint, "rotation", buffer.add(quats[:, joint], "VEC4")) for joint in range(quats.shape[1])]
+    curves = [(joint, "rotation", quats[:, joint]) for joint in range(quats.shape[1])]
     translated = range(1 if motion.hips_in_root_m is None else 2)
-    curves += [(joint, "translation", buffer.add(position[:, joint], "VEC3")) for joint in translated]
-    return gl.Animation(
-        name=name,
-        samplers=[
-            gl.AnimationSampler(input=times, output=out, interpolation="LINEAR") for _, _, out in curves
-        ],
-        channels=[
-            gl.AnimationChannel(sampler=index, target=gl.AnimationChannelTarget(node=joint, path=path))
-            for index, (joint, path, _) in enumerate(curves)
-        ],
-    )
+    curves += [(joint, "translation", position[:, joint]) for joint in translated]
+    return buffer.animation(name, motion.fps, curves)

@@ -128,6 +128,6 @@ def test_channels_are_not_read_where_the_mix_is_enough(
     def refuse(*_: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("bodycap_batch.clocks.estimate.read_channels", refuse)
+    monkeypatch.setattr("bodycap_batch.clocks.sound_evidence.read_channels", refuse)
     cameras = [_write(tmp_path, name, [np.stack([sounds[name]] * 2)]) for name in ("torso", "left_palm")]
     assert estimate_clocks(CaptureConfig(cameras=tuple(cameras))).camera("left_palm").source == "sound"

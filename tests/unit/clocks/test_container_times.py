@@ -7,13 +7,12 @@ import pytest
 from bodycap_batch.capture.frame_index import index_video
 from bodycap_batch.clocks.container_times import (
     ContainerTime,
-    are_dates_apart,
-    duration_text,
     expected_offset,
     read_container_time,
     timecode_seconds,
 )
-from bodycap_batch.clocks.recorders import Recorder
+from bodycap_batch.clocks.reasons import duration_text
+from bodycap_batch.clocks.sound_track import Recorder
 from tests.gpmf import Sensor, item, nested, payloads, write_gopro
 from tests.videos import textured_frame
 
@@ -97,7 +96,7 @@ def test_nothing_is_known_without_times():
 def test_dates_days_apart():
     found = expected_offset(start(0.0), start(3 * DAY_S))
     assert found is not None
-    assert are_dates_apart(found)
+    assert found.are_dates_apart()
     assert duration_text(found.offset_s) == "3.0 days"
     assert duration_text(-7200.0) == "2.0 hours"
     assert duration_text(12.34) == "12.3 s"

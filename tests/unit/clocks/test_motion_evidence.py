@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from bodycap_batch.clocks.container_times import ContainerTime
-from bodycap_batch.clocks.estimate import ClockEstimate, ClockEstimates, Recording, SoundEvidence
+from bodycap_batch.clocks.estimate import ClockEstimate, ClockEstimates
 from bodycap_batch.clocks.joint_offsets import JointClock
 from bodycap_batch.clocks.motion_evidence import add_motion
 from bodycap_batch.clocks.motion_offsets import MotionClocks, MotionCurve
 from bodycap_batch.clocks.motion_signals import CameraPath, motion_signals
 from bodycap_batch.clocks.pair_offsets import PairOffset
+from bodycap_batch.clocks.sound_evidence import Recording, SoundEvidence
 
 REFERENCE = ClockEstimate(camera="torso", offset_s=0.0, sigma_s=0.0, source="common")
 NONE = ClockEstimate(camera="palm", offset_s=None, sigma_s=None, source="none", reasons=("no sound",))

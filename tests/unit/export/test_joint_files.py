@@ -12,9 +12,9 @@ import pytest
 
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.errors import JobError, StoreError
-from bodycap_batch.export.joint_tables import write_joint_arrays, write_joint_table
 from bodycap_batch.export.layout import apply_layout
 from bodycap_batch.export.motion_files import motion_difference, points_from_motion
+from bodycap_batch.export.tables import write_joint_arrays, write_joint_table
 from bodycap_batch.formats import optional_libraries, usd
 from bodycap_batch.formats.c3d import LabelledPoints, read_c3d, write_c3d
 from bodycap_batch.formats.fbx import blender_process

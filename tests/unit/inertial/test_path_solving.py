@@ -11,8 +11,7 @@ from bodycap_batch.config.options import TelemetryOptions
 from bodycap_batch.inertial import use_sensor
 from bodycap_batch.model.geometry import Similarity, so3_exp
 from bodycap_batch.model.scene import FrameStatus, Trajectory
-from bodycap_batch.telemetry.saturation import saturated_stretches
-from bodycap_batch.telemetry.streams import GYROSCOPE
+from bodycap_batch.telemetry.streams import GYROSCOPE, saturated_stretches
 from tests.inertial import Hand, Sensor, solved
 
 SECONDS = 6.0

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.export.joint_tables import write_joint_table
+from bodycap_batch.export.tables import write_joint_table
 from bodycap_batch.formats.bvh import write_bvh
 from bodycap_batch.formats.joint_positions import ROLE_BY_TRUTH_NAME
 from bodycap_batch.model.geometry import so3_exp
