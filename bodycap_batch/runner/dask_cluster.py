@@ -18,9 +18,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bodycap_batch.core.errors import BodycapError, Cancelled, JobError, StoreError, error_from_dict
+from bodycap_batch.core.errors import BodycapError, JobError, StoreError, error_from_dict
 from bodycap_batch.runner import CHILD_COMMAND, Task, TaskEnvironment
-from bodycap_batch.runner.child_pool import STOPPED
+from bodycap_batch.runner.child_pool import stopped
+from bodycap_batch.runner.child_process import POLL_S
 from bodycap_batch.runner.remote import remote_order, run_order
 from bodycap_batch.runner.turns import Turns
 
@@ -32,8 +33,6 @@ QUEUES = ("slurm", "pbs")
 MEMORY = "memory"
 """Name of the Dask resource with which a worker declares its memory (MB). Tasks reserve parts of this memory
 while they run on the worker."""
-_POLL_S = 0.2
-"""Time (seconds) between two checks whether a waiting job was stopped. Evidence: none."""
 _PROGRESS_PERIOD_S = 1.0
 """Minimum time (seconds) between two reports of a task's progress. Each report takes a few milliseconds on
 the worker, on the scheduler and on the client. Evidence: none."""
@@ -131,9 +130,9 @@ class Cluster:
         """
         while (largest := self._largest_worker()) is None:
             if environment.cancelled():
-                raise Cancelled(STOPPED, hint="run the job again to continue")
+                raise stopped()
             environment.progress(0, 0, "waiting for a worker")
-            time.sleep(_POLL_S)
+            time.sleep(POLL_S)
         return {MEMORY: min(float(task.memory_mb), largest)} if largest else None
 
     def _largest_worker(self) -> float | None:
@@ -155,10 +154,10 @@ class Cluster:
     def _wait(self, future: Any, task: Task, environment: TaskEnvironment) -> dict[str, Any]:
         ended = threading.Event()
         future.add_done_callback(lambda _: ended.set())
-        while not ended.wait(_POLL_S):
+        while not ended.wait(POLL_S):
             if environment.cancelled():
                 future.cancel()
-                raise Cancelled(STOPPED, hint="run the job again to continue")
+                raise stopped()
             if self._client.status in _CLIENT_LEFT:
                 raise _lost()
         if future.status == "finished":
