@@ -59,20 +59,16 @@ class LivePage:
 
         from bodycap_batch.watch.web.app import make_app
         from bodycap_batch.watch.web.connections import (
-            ACCEPT_BATCH,
             SWEEP_PERIOD_S,
             LimitedConnection,
-            LimitedListener,
             close_connections_without_progress,
             connection_limits,
         )
 
         remove_abandoned_uploads(self._spool.inbox)
-        self._socket = LimitedListener(self._socket, connection_limits())
         app = make_app(self._job_list, self.access, self._uploads, self._stopped)
         config = uvicorn.Config(
             app,
-            loop="asyncio",  # another event loop would not call `LimitedListener.accept`
             http=LimitedConnection,
             log_level="warning",
             access_log=False,
@@ -80,7 +76,7 @@ class LivePage:
             server_header=False,
             proxy_headers=False,
             ws="none",
-            backlog=ACCEPT_BATCH,
+            backlog=connection_limits().total,  # the event loop accepts this number at a time
             timeout_graceful_shutdown=_SHUTDOWN_S,
             timeout_notify=SWEEP_PERIOD_S,
         )
