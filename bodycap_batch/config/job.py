@@ -39,7 +39,6 @@ from bodycap_batch.config.models import (
 from bodycap_batch.config.mounts import TRUNK_ROLES, mount_of, place_of_role
 from bodycap_batch.config.origins import LoadedJob, Source
 from bodycap_batch.config.overrides import NO_HEIGHT, Overrides
-from bodycap_batch.config.places import Places
 from bodycap_batch.config.resolved_camera import ResolvedCamera, resolved_camera, with_found_calibrations
 from bodycap_batch.config.retired_options import without_retired_options
 from bodycap_batch.config.rules import missing_files, problems_in, skeleton_of
@@ -133,8 +132,7 @@ def load_job_with_origins(
         if policy is None:
             results = source.stated_results(overrides)
             overrides, kept = overrides.with_last_run(source.data, results)
-        places = Places(overrides.mounts, overrides.places, overrides.last_mounts)
-        stated = _stated_job(source, places, alone=alone)
+        stated = _stated_job(source, overrides, alone=alone)
         loaded = _resolved_job(stated, overrides, prepare, policy, is_draft=is_draft)
         return replace(loaded, warnings=(*loaded.warnings, *retired, *([kept] if kept else ())))
     except PermissionError as error:
@@ -262,39 +260,41 @@ class _StatedJob:
     placed: Mapping[str, Source] = field(default_factory=dict)
 
 
-def _stated_job(source: _Source, places: Places, *, alone: bool) -> _StatedJob:
+def _stated_job(source: _Source, overrides: Overrides, *, alone: bool) -> _StatedJob:
     """Return the job with the values of its file and with the cameras of its folder.
 
     Args:
         source: The job file, or the folder of videos.
-        places: The places of cameras on the body that the command line gives.
+        overrides: Values of the command line and of the last run, with the places of cameras on the body.
         alone: True for a job file that another user submitted without a folder.
     """
-    stated = _stated_without_places(source, places, alone=alone)
+    stated = _stated_without_places(source, overrides, alone=alone)
     listed = stated.job.capture.cameras
-    placed = {camera.name: given[1] for camera in listed if (given := places.given_to(camera)) is not None}
-    cameras = tuple(map(places.mounted, listed))
-    places.require_used(listed)
+    placed = {camera.name: given[1] for camera in listed if (given := overrides.place_of(camera)) is not None}
+    cameras = tuple(map(overrides.mounted, listed))
+    overrides.require_used(listed)
     capture = stated.job.capture.model_copy(update={"cameras": cameras})
     return replace(stated, job=stated.job.model_copy(update={"capture": capture}), placed=placed)
 
 
-def _stated_without_places(source: _Source, places: Places, *, alone: bool) -> _StatedJob:
+def _stated_without_places(source: _Source, overrides: Overrides, *, alone: bool) -> _StatedJob:
     if source.file is None:
         refuse_missing_cameras(source.path)
-        job = _validated({"capture": folder_capture(source.path, places.is_known)}, source)
+        job = _validated({"capture": folder_capture(source.path, overrides.is_known)}, source)
         return _StatedJob(source=source, job=job, stated=_without_cameras(job.capture), uses_folder=True)
     stated_data = _top_mapping(source.file)
-    data = stated_data if alone else _with_folder_capture(stated_data, source.folder, places)
+    data = stated_data if alone else _with_folder_capture(stated_data, source.folder, overrides)
     job = _validated(data, source)
-    places = replace(places, worn=places.worn or job.capture.places)
     if data is not stated_data:
         return _StatedJob(source=source, job=job, stated=_without_cameras(job.capture), uses_folder=True)
     uses_folder = not alone and source.is_folder and not (source.folder / RUN_FILE).is_file()
     stated, beside = job.capture, VideosBeside()
     # The videos of a synthetic capture exist only after they have been rendered, so they are not looked for.
     if uses_folder and not stated.cameras_only and stated.synthetic is None:
-        beside = find_videos_beside(source.path, stated.cameras, places)
+        are_found = bool(stated.places)
+        beside = find_videos_beside(
+            source.path, stated.cameras, lambda name: are_found or overrides.is_known(name)
+        )
         if beside.cameras:
             listed = _with_lists(data)["capture"]
             capture = {**listed, "cameras": [*listed["cameras"], *beside.cameras]}
@@ -466,7 +466,7 @@ def _top_mapping(source: YamlSource) -> dict[str, Any]:
     return source.data
 
 
-def _with_folder_capture(data: dict[str, Any], folder: Path, places: Places) -> dict[str, Any]:
+def _with_folder_capture(data: dict[str, Any], folder: Path, overrides: Overrides) -> dict[str, Any]:
     """Return the data of a job file. If no cameras are listed, add the videos in the job file's folder.
 
     The cameras are named after these videos, as for a folder without a job file. Data with an unknown key are
@@ -483,7 +483,7 @@ def _with_folder_capture(data: dict[str, Any], folder: Path, places: Places) -> 
     except CaptureError:  # no videos here: the validation reports the missing cameras
         return data
     are_found = bool(capture.get("places"))
-    found = folder_capture(folder, lambda name: are_found or places.is_known(name))
+    found = folder_capture(folder, lambda name: are_found or overrides.is_known(name))
     return {**data, "capture": {**found, **capture}}
 
 
