@@ -36,10 +36,6 @@ while they run on the worker."""
 _PROGRESS_PERIOD_S = 1.0
 """Minimum time (seconds) between two reports of a task's progress. Each report takes a few milliseconds on
 the worker, on the scheduler and on the client. Evidence: none."""
-_WORKERS_PERIOD_S = 2.0
-"""Minimum time (seconds) between two requests for the scheduler's list of workers. The list must be renewed,
-because workers start and end. A request for each task would take longer than the submission of the task.
-Evidence: none."""
 _CLIENT_LEFT = ("closing", "closed")
 _WORKER_ENDS = ("closing", "closed", "failed")
 _ALLOWED_FAILURES = 1
@@ -65,11 +61,6 @@ class Cluster:
         self._progress: dict[str, Callable[[int, int, str], None]] = {}
         self._lock = threading.Lock()
         self._turns = Turns()
-        # Lock for requests to the scheduler. It must not be `_lock`: Dask's thread waits for `_lock` in
-        # `_receive_progress`, and this thread must be free to receive the scheduler's answer.
-        self._asking = threading.Lock()
-        self._largest_memory: float | None = None
-        self._last_asked = -math.inf
         with _lost_connection():
             self._client.subscribe_topic(self._topic, self._receive_progress)
             self._client.run_on_scheduler(_allow_failures, _ALLOWED_FAILURES)
@@ -141,15 +132,9 @@ class Cluster:
         Returns:
             The memory; 0 if no worker declares its memory; None if there is no worker.
         """
-        with self._asking:
-            if self._largest_memory is None or time.monotonic() - self._last_asked > _WORKERS_PERIOD_S:
-                if self._client.status in _CLIENT_LEFT:
-                    raise _lost()
-                workers = self.workers().values()
-                memories = (resources.get(MEMORY, 0.0) for resources in workers)
-                self._largest_memory = max(memories, default=None)
-                self._last_asked = time.monotonic()
-            return self._largest_memory
+        if self._client.status in _CLIENT_LEFT:
+            raise _lost()
+        return max((declared.get(MEMORY, 0.0) for declared in self.workers().values()), default=None)
 
     def _wait(self, future: Any, task: Task, environment: TaskEnvironment) -> dict[str, Any]:
         ended = threading.Event()
