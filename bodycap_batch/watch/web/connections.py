@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
+import logging
 import resource
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal
 
 import h11
@@ -85,15 +87,7 @@ class LimitedConnection(H11Protocol):
         same = sum(each.client_network == self.client_network for each in others)
         limits = connection_limits()
         if len(others) >= limits.total or same >= limits.per_address:
-            self.logger.warning(
-                "closed a new connection of %s: %d connections are open, %d of them from this address "
-                "(limits: %d and %d)",
-                self.client_network,
-                len(others),
-                same,
-                limits.total,
-                limits.per_address,
-            )
+            _report_limits(limits)
             self.connections.discard(self)
             transport.abort()
 
@@ -132,7 +126,17 @@ class LimitedConnection(H11Protocol):
         return None
 
 
-async def close_connections_without_progress(connections: set[Any]) -> None:
+@cache
+def _report_limits(limits: ConnectionLimits) -> None:
+    """Tell the operator, once in a process, that connections above the limits are closed."""
+    logging.getLogger(__name__).warning(
+        "new connections to the live page are closed at once while %d are open, or %d from one address",
+        limits.total,
+        limits.per_address,
+    )
+
+
+def close_connections_without_progress(connections: set[Any]) -> None:
     """Close the connections whose clients have made no progress for too long.
 
     Args:

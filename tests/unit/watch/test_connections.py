@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import resource
 from collections.abc import Iterator
 from typing import Any
@@ -18,7 +17,6 @@ from bodycap_batch.watch.web.connections import (
     LimitedConnection,
     connection_limits,
 )
-from bodycap_batch.watch.web.log_rate import MessageRateLimit
 
 
 @pytest.mark.parametrize(
@@ -111,13 +109,19 @@ def connection(loop: asyncio.AbstractEventLoop) -> Connection:
 
 @pytest.mark.parametrize(("total", "per_address"), [(2, 9), (9, 2)])
 def test_a_connection_above_a_limit_is_closed(
-    loop: asyncio.AbstractEventLoop, monkeypatch: pytest.MonkeyPatch, total: int, per_address: int
+    loop: asyncio.AbstractEventLoop,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    total: int,
+    per_address: int,
 ) -> None:
     limits = ConnectionLimits(total=total, per_address=per_address)
     monkeypatch.setattr(connections, "connection_limits", lambda: limits)
+    connections._report_limits.cache_clear()
     state = ServerState()
     clients = [Connection(loop, state) for _ in range(4)]
     assert [client.transport.aborted for client in clients] == [False, False, True, True]
+    assert len(caplog.records) == 1, "reported once"
     other = Connection(loop, state, "10.0.0.2")
     assert other.transport.aborted == (total == 2)
     clients[0].protocol.connection_lost(None)
@@ -183,18 +187,3 @@ def test_a_closed_connection_that_sends_the_last_data_ends_in_time(connection: C
     connection.transport.close()
     assert not connection.is_closed_at(0)
     assert connection.is_closed_at(11)
-
-
-def test_log_messages_are_limited_and_counted() -> None:
-    now = [0.0]
-    limit = MessageRateLimit(lambda: now[0])
-
-    def passed(level: int = logging.WARNING) -> str:
-        record = logging.LogRecord("web", level, "", 0, "bad request of %s", ("10.0.0.1",), None)
-        return record.getMessage() if limit.filter(record) else ""
-
-    assert [bool(passed()) for _ in range(15)] == [True] * 10 + [False] * 5
-    assert passed(logging.ERROR)  # other levels have their own limit
-    now[0] = 60.0
-    assert passed() == "bad request of 10.0.0.1 (5 earlier messages were left out)"
-    assert passed() == "bad request of 10.0.0.1"
