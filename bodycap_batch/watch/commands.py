@@ -262,7 +262,7 @@ def _waiting_row(entry: InboxEntry) -> JobRow:
         name=entry.name,
         state="waiting",
         since=utc_text(changed),
-        age_s=_age_s(utc_text(changed)),
+        age_s=_seconds_between(utc_text(changed), utc_text()),
         cause=waits_for,
         path=str(entry.path),
     )
@@ -297,7 +297,7 @@ def job_row(job: JobDir, is_watched: bool = True) -> JobRow:
         stage=f"{status.get('stage', '')} {status.get('camera', '')}".strip() if state != "done" else "",
         progress=status.get("progress") if running else None,
         since=str(since or ""),
-        age_s=_age_s(since),
+        age_s=_seconds_between(since, utc_text()),
         duration_s=_seconds_between(status.get("started_at"), status.get("finished_at")),
         cause=cause,
         hint=str(error.get("hint") or ""),
@@ -313,14 +313,6 @@ def _seconds_between(start: object, end: object) -> float | None:
         first, last = (datetime.fromisoformat(str(moment)) for moment in (start, end))
         return round((last - first).total_seconds(), 1)
     except (ValueError, TypeError):
-        return None
-
-
-def _age_s(moment: object) -> float | None:
-    """Return the time (seconds) since a moment that is given as text; None if the text is not a time."""
-    try:
-        return round(time.time() - datetime.fromisoformat(str(moment)).timestamp(), 1)
-    except ValueError:
         return None
 
 

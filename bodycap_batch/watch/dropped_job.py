@@ -175,30 +175,19 @@ def make_result_paths_relative(job_dir: JobDir, job: Job) -> None:
 
     Args:
         job_dir: The job's folder.
-        job: The job that was run. Places that the run found from the motion are kept.
+        job: The job that was run. It replaces a `job.yaml` of another version, or a damaged one.
 
     Raises:
         StoreError: The disk is full or fails.
     """
     for file in (job_dir.result / "job.yaml", job_dir.result / "partial" / "job.yaml"):
         if file.is_file():
+            try:
+                written = Job.model_validate(yaml.safe_load(file.read_text(encoding="utf-8")))
+            except (yaml.YAMLError, ValueError):
+                written = job
             change = partial(_relative_to_file, job_dir=job_dir.path, file=file)
-            found = _with_found_places(job, file)
-            write_results_file(file.parent, file.name, yaml_from_job(found.with_paths(change)))
-
-
-def _with_found_places(job: Job, results: Path) -> Job:
-    """Return a job with the places that its run found, as the `job.yaml` of its results says."""
-    if not job.capture.unplaced():
-        return job
-    try:
-        document = yaml.safe_load(results.read_text(encoding="utf-8", errors="replace"))
-        cameras = document["capture"]["cameras"]
-        places = {each["name"]: each["mount"] for each in cameras if each.get("mount_source") == "motion"}
-    except (yaml.YAMLError, AttributeError, KeyError, TypeError):  # left by another version, or damaged
-        return job
-    is_complete = all(camera.name in places for camera in job.capture.unplaced())
-    return job.with_places(places) if is_complete else job
+            write_results_file(file.parent, file.name, yaml_from_job(written.with_paths(change)))
 
 
 def yaml_from_job(job: Job) -> str:
