@@ -26,6 +26,7 @@ from bodycap_batch.capture.video import (
     projection_from_frame,
     video_stream,
 )
+from bodycap_batch.config.bounds import ASPECT_TOLERANCE, MAX_TIME_S
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.formats.file_completeness import missing_part
@@ -34,19 +35,12 @@ if TYPE_CHECKING:
     from av.container import InputContainer
 
 
-_MAX_SECONDS = 4e9
-"""Maximum absolute value, seconds, of a timestamp. Derivation: the limit is later than the Unix time of any
-recording, and far below the largest number of nanoseconds in 64 bits."""
 _MIN_PIXEL_ASPECT = Fraction(2, 5)
 """Minimum plausible pixel aspect, width over height. The maximum is the inverse of this value. Origin: HDV
 and AVCHD have 4:3; television and anamorphic lenses have pixel aspects between 1:2 and 2:1."""
 _NO_ZERO = 0x200
 """Flag of containers whose times start at an arbitrary number: MPEG transport and program streams. Origin:
 FFmpeg's AVFMT_TS_DISCONT."""
-_SQUARE_TOLERANCE = 0.004
-"""Maximum difference of the pixel aspect from 1. With a smaller difference, the pixels are treated as square.
-Origin: image sizes are rounded to even numbers. Resampling would blur every image to correct an error of less
-than one pixel."""
 
 
 def index_videos(paths: Iterable[Path], threads: int = 0) -> tuple[VideoFile, ...]:
@@ -94,7 +88,7 @@ def index_video(path: Path, threads: int = 0, part: tuple[int, int] | None = Non
         )
         time_base, rate = Fraction(stream.time_base or 0), stream.average_rate or stream.guessed_rate
         pixel_aspect = _pixel_aspect(stream.sample_aspect_ratio)
-    if max(abs(int(pts[0])), abs(int(pts[-1]))) * time_base > _MAX_SECONDS or time_base <= 0:
+    if max(abs(int(pts[0])), abs(int(pts[-1]))) * time_base > MAX_TIME_S or time_base <= 0:
         raise CaptureError(
             "the times of the frames in the video file are not plausible", path=path, hint=COPY_AGAIN
         )
@@ -179,11 +173,12 @@ def _nominal_fps(pts: IntArray, time_base: Fraction, rate: Fraction | None) -> f
 def _pixel_aspect(stated: Fraction | None) -> Fraction:
     """Return the pixel aspect: the width of a stored pixel over its height.
 
-    It is 1 if the value in the file is missing, implausible or nearly 1.
+    It is 1 if the value in the file is missing, implausible or nearly 1: resampling would blur every image to
+    correct an error of less than one pixel.
     """
     aspect = Fraction(stated or 1)
     is_plausible = _MIN_PIXEL_ASPECT <= aspect <= 1 / _MIN_PIXEL_ASPECT
-    return aspect if is_plausible and abs(aspect - 1) > _SQUARE_TOLERANCE else Fraction(1)
+    return aspect if is_plausible and abs(aspect - 1) > ASPECT_TOLERANCE else Fraction(1)
 
 
 def _creation_time(metadata: dict[str, str]) -> float | None:

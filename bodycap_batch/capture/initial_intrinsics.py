@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from bodycap_batch.capture.video import VideoFile
+from bodycap_batch.config.bounds import ASPECT_TOLERANCE
 from bodycap_batch.config.calibration import Calibration
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import Camera, with_two_focal_lengths
@@ -22,11 +23,6 @@ refines the value."""
 _FULL_FRAME_MM = 36.0
 """Width of a 35 mm film frame, millimetres. The definition of the 35 mm equivalent focal length uses this
 width."""
-
-
-_ASPECT_TOLERANCE = 0.004
-"""Maximum relative difference between two aspect ratios that are treated as equal. Origin: one pixel in an
-image of 640×480, because encoders round image sizes to even numbers."""
 
 
 def work_size(
@@ -88,7 +84,7 @@ def work_camera(calibration: Calibration, video: VideoFile, work_px: int) -> Cam
 
 def _same_aspect(calibration: Calibration, width: int, height: int) -> bool:
     """Return True if a calibration has the same aspect ratio as an image of this width and height."""
-    return abs(width * calibration.height / (height * calibration.width) - 1.0) <= _ASPECT_TOLERANCE
+    return abs(width * calibration.height / (height * calibration.width) - 1.0) <= ASPECT_TOLERANCE
 
 
 def guessed_fov_deg(video: VideoFile, fov_deg: float | None) -> tuple[float, FovSource]:
@@ -112,11 +108,10 @@ def guessed_camera(video: VideoFile, work_px: int, fov_deg: float | None) -> Cam
     """
     width, height = work_size_of(video, work_px)
     long_side = max(width, height)
-    if fov_deg is not None:
-        focal = 0.5 * long_side / np.tan(0.5 * np.radians(fov_deg))
-    elif video.focal_35mm is not None:
+    used_fov_deg, source = guessed_fov_deg(video, fov_deg)
+    if source == "video metadata" and video.focal_35mm is not None:
         focal = long_side * video.focal_35mm / _FULL_FRAME_MM
     else:
-        focal = 0.5 * long_side / np.tan(0.5 * np.radians(_GUESSED_FOV_DEG))
+        focal = 0.5 * long_side / np.tan(0.5 * np.radians(used_fov_deg))
     params = np.array([focal, 0.5 * width, 0.5 * height, 0.0])
     return Camera(model="SIMPLE_RADIAL", width_px=width, height_px=height, params=params, refine=True)

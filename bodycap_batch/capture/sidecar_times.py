@@ -13,7 +13,7 @@ from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.core.text_encoding import decode_text
 
-_NS = 1_000_000_000
+NS = 1_000_000_000
 """Nanoseconds per second."""
 _MAX_BYTES = 256 << 20
 """Maximum size, bytes, of a sidecar file that is read."""
@@ -27,7 +27,7 @@ _UNITS = (
     (1_000, "milliseconds"),
     (1_000_000, "microseconds"),
     (10_000_000, "units of 100 ns"),
-    (_NS, "nanoseconds"),
+    (NS, "nanoseconds"),
 )
 """Units of timestamps: number of units per second, and name."""
 _MAX_UNIT_ERROR = 2.5
@@ -144,9 +144,9 @@ def _unit(path: Path, values: Sequence[Decimal], chapters: Sequence[IntArray]) -
     steps = np.array([float(after - before) for before, after in pairwise(values)])
     own = np.concatenate([np.diff(times) for times in chapters])
     if not len(own):
-        return Decimal(_NS), ""
-    step, own_s = float(np.median(steps[inside[1:]])), float(np.median(own)) / _NS
-    video_s = sum(int(times[-1] - times[0]) for times in chapters) / _NS
+        return Decimal(NS), ""
+    step, own_s = float(np.median(steps[inside[1:]])), float(np.median(own)) / NS
+    video_s = sum(int(times[-1] - times[0]) for times in chapters) / NS
     what = (
         f"the {len(values)} times in {path.name} span {values[-1] - values[0]}, where the video lasts "
         f"{video_s:.2f} s"
@@ -158,9 +158,9 @@ def _unit(path: Path, values: Sequence[Decimal], chapters: Sequence[IntArray]) -
         ratio = step / per_second / own_s
         if 1.0 / _MAX_UNIT_ERROR <= ratio <= _MAX_UNIT_ERROR:
             note = f"{what}: they are read as {name}" if per_second > 1 else ""
-            return Decimal(_NS) / per_second, note
+            return Decimal(NS) / per_second, note
     if _SECONDS_RANGE[0] <= step / own_s <= _SECONDS_RANGE[1]:
-        return Decimal(_NS), f"{what}: they are read as seconds, so the video is played at another speed"
+        return Decimal(NS), f"{what}: they are read as seconds, so the video is played at another speed"
     raise CaptureError(
         f"{what}: in no unit from seconds to nanoseconds do the two agree",
         path=path,

@@ -12,13 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from bodycap_batch.capture.capture_rate import slow_motion
-from bodycap_batch.capture.sidecar_times import sidecar_times
+from bodycap_batch.capture.sidecar_times import NS, sidecar_times
 from bodycap_batch.capture.video import VideoFile
 from bodycap_batch.core.arrays import IntArray
 
-_NS = 1_000_000_000
-"""Nanoseconds per second."""
-_CLOCK_RESOLUTION_NS = 2 * _NS
+_CLOCK_RESOLUTION_NS = 2 * NS
 """Maximum error, nanoseconds, of the difference between the creation times of two files. Creation times are
 rounded to whole seconds. In addition, they are the time at which the camera began to write the file, not the
 time of the first exposure."""
@@ -152,7 +150,7 @@ def _container_times(videos: tuple[VideoFile, ...], own: list[tuple[IntArray, in
         videos: The chapters.
         own: The frame times of each chapter in its file, and its duration, real nanoseconds.
     """
-    shift = -round(videos[0].start_pts * videos[0].time_base * _NS / slow_motion(videos[0])[0])
+    shift = -round(videos[0].start_pts * videos[0].time_base * NS / slow_motion(videos[0])[0])
     parts = [own[0][0] + shift]
     for index, (times, _) in enumerate(own[1:], start=1):
         start, duration_ns = int(own[index - 1][0][0]), own[index - 1][1]
@@ -171,7 +169,7 @@ def _missing_between_ns(before: VideoFile, video: VideoFile, duration_ns: int) -
     """
     if before.created_s is None or video.created_s is None:
         return 0
-    gap = round((video.created_s - before.created_s) * _NS) - duration_ns
+    gap = round((video.created_s - before.created_s) * NS) - duration_ns
     return gap if gap > _CLOCK_RESOLUTION_NS else 0
 
 
@@ -187,6 +185,6 @@ def _join_parts(videos: tuple[VideoFile, ...], parts: list[IntArray], notes: lis
         if abs(gap_ns) > 1.5 * frame_ns:
             kind = "a gap of" if gap_ns > 0 else "an overlap of"
             notes.append(
-                f"there is {kind} {abs(gap_ns) / _NS:.2f} s between {before.path.name} and {video.path.name}"
+                f"there is {kind} {abs(gap_ns) / NS:.2f} s between {before.path.name} and {video.path.name}"
             )
     return Timeline(times_ns=times, usable=usable, notes=tuple(notes))

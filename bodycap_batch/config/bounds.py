@@ -40,3 +40,6 @@ less than a tenth of this time. Evidence: none."""
 MAX_DRIFT_PPM = 1e5
 """Maximum absolute drift (parts per million) of a clock. Crystals drift by less than 100 ppm, and software
 clocks of webcams by less than a tenth. Evidence: none."""
+ASPECT_TOLERANCE = 0.004
+"""Maximum relative difference between two aspect ratios that are treated as equal (no unit). Origin: one
+pixel in an image of 640×480, because encoders round image sizes to even numbers."""

@@ -27,11 +27,10 @@ from bodycap_batch.config.foreign_calibrations import (
     parse_calibration,
 )
 from bodycap_batch.config.mounts import mount_of
+from bodycap_batch.config.yaml_source import MAX_BYTES
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import CAMERA_MODELS, CV2_PIXEL_OFFSET_PX, Camera, parameter_count
 
-_MAX_BYTES = 1 << 20
-"""Maximum size (bytes) of a calibration file. Real calibration files have a few kilobytes. Evidence: none."""
 _CENTRE_INDEX = {
     "SIMPLE_PINHOLE": 1,
     "SIMPLE_RADIAL": 1,
@@ -349,7 +348,7 @@ def implausible_calibration(
 
 def _read_content(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > _MAX_BYTES:
+        if path.stat().st_size > MAX_BYTES:
             raise CaptureError(
                 "the file is too large for a calibration",
                 path=path,

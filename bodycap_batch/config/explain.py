@@ -14,7 +14,7 @@ from pydantic.fields import FieldInfo
 from bodycap_batch.config.yaml_source import Location, YamlSource, dotted
 from bodycap_batch.core.errors import JobError
 
-_MAX_FURTHER = 5
+MAX_FURTHER = 5
 """Maximum number of problems that a message lists after the first problem. Evidence: none."""
 _MISSING = "this key is missing"
 _DID_YOU_MEAN = "did you mean "
@@ -59,7 +59,7 @@ def job_error(
         source: The YAML file of the job, for line numbers; None if there is no such file.
     """
     ordered = sorted(problems, key=lambda p: (source.line_of(p.location) or 0) if source else 0)
-    first, further = ordered[0], ordered[1 : 1 + _MAX_FURTHER]
+    first, further = ordered[0], ordered[1 : 1 + MAX_FURTHER]
     also = "".join(f"; also {_place(p, source)}: {p.message}" for p in further)
     return JobError(
         first.message + also,

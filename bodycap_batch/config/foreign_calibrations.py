@@ -21,6 +21,7 @@ from xml.etree import ElementTree as ET
 
 import yaml
 
+from bodycap_batch.config.yaml_source import MAX_DEPTH
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.core.text_encoding import decode_text
 
@@ -57,8 +58,6 @@ _LENSES = {
     "eucm": "eucm", "omni": "omni", "fov": "fov",
 }  # fmt: skip
 """Kind of each lens model that can be expressed, by its name in small letters without separators."""
-_MAX_DEPTH = 20
-"""Maximum nesting depth (levels) of a file. Real files have six levels. Evidence: none."""
 _MAX_SKEW_PX = 0.1
 """Maximum displacement (pixels) at the edge of the picture by axes that are not perpendicular. The axes of
 COLMAP's models are perpendicular. Derivation: a third of the noise of a keypoint."""
@@ -107,8 +106,8 @@ def _parsed(text: str) -> object:
     if "\0" in text:
         raise ValueError("it is binary")
     levels = itertools.accumulate((letter in "[{") - (letter in "]}") for letter in text)
-    if max(levels, default=0) > _MAX_DEPTH:
-        raise ValueError(f"its blocks are nested deeper than {_MAX_DEPTH} levels")
+    if max(levels, default=0) > MAX_DEPTH:
+        raise ValueError(f"its blocks are nested deeper than {MAX_DEPTH} levels")
     start = text.lstrip()[:1]
     if start == "{":
         return json.loads(text)

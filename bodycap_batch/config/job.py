@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from bodycap_batch.config.body_height import height_from_text
 from bodycap_batch.config.calibration import Calibration, implausible_calibration
-from bodycap_batch.config.explain import Problem, job_error, problems_of
+from bodycap_batch.config.explain import MAX_FURTHER, Problem, job_error, problems_of
 from bodycap_batch.config.folder import (
     ARCHIVE_SUFFIXES,
     CALIBRATION_FILE,
@@ -28,6 +28,7 @@ from bodycap_batch.config.folder import (
 )
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import (
+    MAX_NAME_LENGTH,
     NO_SKELETON,
     SKELETON_PRESETS,
     Activity,
@@ -38,7 +39,6 @@ from bodycap_batch.config.models import (
 from bodycap_batch.config.mounts import TRUNK_ROLES, mount_of, place_of_role
 from bodycap_batch.config.origins import LoadedJob, Source
 from bodycap_batch.config.overrides import NO_HEIGHT, Overrides
-from bodycap_batch.config.places import Places
 from bodycap_batch.config.resolved_camera import ResolvedCamera, resolved_camera, with_found_calibrations
 from bodycap_batch.config.retired_options import without_retired_options
 from bodycap_batch.config.rules import missing_files, problems_in, skeleton_of
@@ -50,12 +50,6 @@ from bodycap_batch.core.errors import CaptureError, JobError
 
 _LISTS = ("video", "timestamps")
 """Names of the fields of a camera in which a job file may give a single path instead of a list of paths."""
-_MAX_MISSING = 5
-"""Maximum number of missing files that a message lists after other problems. Evidence: none."""
-_NAME_LENGTH = 100
-"""Maximum number of characters of a job's name. If the job is named after a folder with a longer name, the
-name is shortened. Evidence: none."""
-
 RESULTS = "out"
 """Name of the folder for results beside a job. The folder of one job's results is a subfolder of it."""
 
@@ -74,8 +68,7 @@ def results_of_job(path: Path, overrides: Overrides | None = None) -> Path:
     Raises:
         JobError: The file is no YAML file, or there is none.
     """
-    full = _job_source(path.resolve(), None)
-    return _stated_results(full, _read_source(full, Limits()), overrides or Overrides())
+    return _source_at(path.resolve(), None, Limits()).stated_results(overrides or Overrides())
 
 
 def load_job(
@@ -131,14 +124,15 @@ def load_job_with_origins(
     # users.
     alone = policy is not None and policy.folder is None and not full.is_dir()
     try:
-        full = _job_source(full, policy)
-        source, retired = without_retired_options(_read_source(full, limits or Limits()))
+        source = _source_at(full, policy, limits or Limits())
+        full = source.path
+        file, retired = without_retired_options(source.file)
+        source = replace(source, file=file)
         overrides, kept = overrides or Overrides(), ""
         if policy is None:
-            results = _stated_results(full, source, overrides)
-            overrides, kept = overrides.with_last_run(_mapping(source), results)
-        places = Places(overrides.mounts, overrides.places, overrides.last_mounts)
-        stated = _stated_job(full, source, places, alone=alone)
+            results = source.stated_results(overrides)
+            overrides, kept = overrides.with_last_run(source.data, results)
+        stated = _stated_job(source, overrides, alone=alone)
         loaded = _resolved_job(stated, overrides, prepare, policy, is_draft=is_draft)
         return replace(loaded, warnings=(*loaded.warnings, *retired, *([kept] if kept else ())))
     except PermissionError as error:
@@ -151,51 +145,96 @@ def load_job_with_origins(
         ) from error
 
 
-def _job_source(full: Path, policy: PathPolicy | None) -> Path:
-    """Return the job file in the folder `full`; return `full` itself if it is a file or has no job file."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Source:
+    """What a job is loaded from: a folder of videos, or a job file.
+
+    Attributes:
+        path: The folder or the file.
+        file: The parsed file; None for a folder.
+    """
+
+    path: Path
+    file: YamlSource | None
+
+    @property
+    def folder(self) -> Path:
+        """Folder to which the paths of the job are relative."""
+        return self.path if self.file is None else self.path.parent
+
+    @property
+    def is_folder(self) -> bool:
+        """True for a folder of videos, also with a ``job.yaml`` in it."""
+        return self.file is None or self.path.name in JOB_FILES
+
+    @property
+    def data(self) -> Mapping[str, Any]:
+        """The data of the job file; empty if there is none, or if the data are no mapping."""
+        return self.file.data if self.file is not None and isinstance(self.file.data, dict) else {}
+
+    @property
+    def name(self) -> str:
+        """Name of the job if its job file gives none."""
+        return safe_name(self.folder.name if self.is_folder else self.path.stem)
+
+    def stated_results(self, overrides: Overrides) -> Path:
+        """Return the folder for the results of the job before it is validated."""
+        return self.results(self.data.get("name"), self.data.get("out"), overrides)
+
+    def results(self, name: Any, out: Any, overrides: Overrides) -> Path:
+        """Return the folder for the results. It does not depend on the working folder.
+
+        Args:
+            name: Name of the job in the job file; of another type or empty if it gives none.
+            out: Folder for the results in the job file; of another type if it gives none.
+            overrides: Values of the command line.
+        """
+        if overrides.out is not None:
+            return overrides.out.resolve()
+        if isinstance(out, Path) or _is_path_text(out):
+            return (self.folder / out).resolve()
+        own = (self.folder.parent if self.is_folder else self.folder) / RESULTS
+        named = name if _is_path_text(name) and name else self.name
+        return ((overrides.out_parent or own) / named).resolve()
+
+    def error(self, problems: Sequence[Problem]) -> JobError:
+        """Return one error for problems of the job, with the file and the line of the first one."""
+        return job_error(problems, self.path, self.file)
+
+
+def _source_at(full: Path, policy: PathPolicy | None, limits: Limits) -> _Source:
+    """Read the job file at a path, or the one in the folder at the path, if there is one."""
     found = job_file_in(full) if full.is_dir() else None
-    if found is None:
-        return full
-    if policy is not None:
-        policy.require(found)
-    return found
-
-
-def _read_source(full: Path, limits: Limits) -> YamlSource | None:
-    """Return the parsed YAML file of a job; None for a folder of videos."""
+    if found is not None:
+        if policy is not None:
+            policy.require(found)
+        full = found
     if full.is_dir():
-        return None
+        return _Source(path=full, file=None)
     _require_job_file(full)
-    return read_yaml(full, max_bytes=int(1024 * limits.yaml_kb), max_depth=int(limits.yaml_depth))
+    file = read_yaml(full, max_bytes=int(1024 * limits.yaml_kb), max_depth=int(limits.yaml_depth))
+    return _Source(path=full, file=file)
 
 
 def _require_job_file(full: Path) -> None:
     """Raise `JobError` if a file does not exist, or is a video, a photo or an archive instead of a job."""
-    suffix = full.suffix.lower()
     if not full.exists():
         raise JobError(
             "there is no such file or folder",
             path=full,
             hint="correct the path; give a folder of videos, a job file (YAML) or a folder of results",
         )
-    if suffix in VIDEO_SUFFIXES:
-        raise JobError(
-            "this file is a video, not a job",
-            path=full,
-            hint=f"give the folder that contains the video: {full.parent}",
-        )
-    if suffix in PHOTO_SUFFIXES:
-        raise JobError(
-            "this file is a photo, not a job",
-            path=full,
-            hint="give a folder of videos; photos are not used",
-        )
-    if suffix in ARCHIVE_SUFFIXES:
-        raise JobError(
-            "this file is an archive, not a folder of videos",
-            path=full,
-            hint="unpack it, and give the folder with the videos",
-        )
+    for suffixes, message, hint in (
+        (VIDEO_SUFFIXES, "a video, not a job", f"give the folder that contains the video: {full.parent}"),
+        (PHOTO_SUFFIXES, "a photo, not a job", "give a folder of videos; photos are not used"),
+        (
+            ARCHIVE_SUFFIXES,
+            "an archive, not a folder of videos",
+            "unpack it, and give the folder with the videos",
+        ),
+    ):
+        if full.suffix.lower() in suffixes:
+            raise JobError(f"this file is {message}", path=full, hint=hint)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -203,8 +242,7 @@ class _StatedJob:
     """A job with the values of its file, before it is resolved.
 
     Attributes:
-        path: The job file, or the folder of videos.
-        source: The parsed job file; None for a folder of videos.
+        source: The job file, or the folder of videos.
         job: The job as stated, with the cameras that were found in its folder.
         stated: The capture as the job file states it; without cameras if it lists none.
         uses_folder: True if the job uses the videos and the calibration in its folder.
@@ -213,8 +251,7 @@ class _StatedJob:
         placed: Where the place of a camera comes from if not from the job file, by camera name.
     """
 
-    path: Path
-    source: YamlSource | None
+    source: _Source
     job: Job
     stated: CaptureConfig
     uses_folder: bool
@@ -222,63 +259,48 @@ class _StatedJob:
     beside: VideosBeside = field(default_factory=VideosBeside)
     placed: Mapping[str, Source] = field(default_factory=dict)
 
-    @property
-    def folder(self) -> Path:
-        """Folder to which the paths of the job are relative."""
-        return self.path if self.source is None else self.path.parent
 
-
-def _stated_job(full: Path, source: YamlSource | None, places: Places, *, alone: bool) -> _StatedJob:
+def _stated_job(source: _Source, overrides: Overrides, *, alone: bool) -> _StatedJob:
     """Return the job with the values of its file and with the cameras of its folder.
 
     Args:
-        full: The job file, or the folder of videos.
-        source: The parsed job file; None for a folder of videos.
-        places: The places of cameras on the body that the command line gives.
+        source: The job file, or the folder of videos.
+        overrides: Values of the command line and of the last run, with the places of cameras on the body.
         alone: True for a job file that another user submitted without a folder.
     """
-    stated = _stated_without_places(full, source, places, alone=alone)
+    stated = _stated_without_places(source, overrides, alone=alone)
     listed = stated.job.capture.cameras
-    placed = {camera.name: given[1] for camera in listed if (given := places.given_to(camera)) is not None}
-    cameras = tuple(map(places.mounted, listed))
-    places.require_used(listed)
+    placed = {camera.name: given[1] for camera in listed if (given := overrides.place_of(camera)) is not None}
+    cameras = tuple(map(overrides.mounted, listed))
+    overrides.require_used(listed)
     capture = stated.job.capture.model_copy(update={"cameras": cameras})
     return replace(stated, job=stated.job.model_copy(update={"capture": capture}), placed=placed)
 
 
-def _stated_without_places(
-    full: Path, source: YamlSource | None, places: Places, *, alone: bool
-) -> _StatedJob:
-    if source is None:
-        refuse_missing_cameras(full)
-        data: dict[str, Any] = {"capture": folder_capture(full, places.is_known)}
-        job = _validated(data, full, source)
-        stated = _without_cameras(job.capture)
-        return _StatedJob(path=full, source=None, job=job, stated=stated, uses_folder=True)
-    stated_data = _top_mapping(source)
-    data = stated_data if alone else _with_folder_capture(stated_data, full.parent, places)
-    job = _validated(data, full, source)
-    places = replace(places, worn=places.worn or job.capture.places)
+def _stated_without_places(source: _Source, overrides: Overrides, *, alone: bool) -> _StatedJob:
+    if source.file is None:
+        refuse_missing_cameras(source.path)
+        job = _validated({"capture": folder_capture(source.path, overrides.is_known)}, source)
+        return _StatedJob(source=source, job=job, stated=_without_cameras(job.capture), uses_folder=True)
+    stated_data = _top_mapping(source.file)
+    data = stated_data if alone else _with_folder_capture(stated_data, source.folder, overrides)
+    job = _validated(data, source)
     if data is not stated_data:
-        stated = _without_cameras(job.capture)
-        return _StatedJob(path=full, source=source, job=job, stated=stated, uses_folder=True)
-    uses_folder = not alone and full.name in JOB_FILES and not (full.parent / RUN_FILE).is_file()
+        return _StatedJob(source=source, job=job, stated=_without_cameras(job.capture), uses_folder=True)
+    uses_folder = not alone and source.is_folder and not (source.folder / RUN_FILE).is_file()
     stated, beside = job.capture, VideosBeside()
     # The videos of a synthetic capture exist only after they have been rendered, so they are not looked for.
     if uses_folder and not stated.cameras_only and stated.synthetic is None:
-        beside = find_videos_beside(full, stated.cameras, places)
+        are_found = bool(stated.places)
+        beside = find_videos_beside(
+            source.path, stated.cameras, lambda name: are_found or overrides.is_known(name)
+        )
         if beside.cameras:
             listed = _with_lists(data)["capture"]
             capture = {**listed, "cameras": [*listed["cameras"], *beside.cameras]}
-            job = _validated({**data, "capture": capture}, full, source)
+            job = _validated({**data, "capture": capture}, source)
     return _StatedJob(
-        path=full,
-        source=source,
-        job=job,
-        stated=stated,
-        uses_folder=uses_folder,
-        is_alone=alone,
-        beside=beside,
+        source=source, job=job, stated=stated, uses_folder=uses_folder, is_alone=alone, beside=beside
     )
 
 
@@ -294,20 +316,21 @@ def _resolved_job(
     *,
     is_draft: bool,
 ) -> LoadedJob:
-    full, base, source = stated.path, stated.folder, stated.source
+    source = stated.source
+    base = source.folder
     job = _with_overrides(stated.job, overrides)
     problems = [] if is_draft else problems_in(job)
     if problems:
         is_own = policy is None and job.capture.synthetic is None
-        error = job_error(problems, full, source)
-        for found in missing_files(job, base)[:_MAX_MISSING] if is_own else ():
+        error = source.error(problems)
+        for found in missing_files(job, base)[:MAX_FURTHER] if is_own else ():
             error.message += f"; also {dotted(found.location)}: {found.message}"
         raise error
     if policy is not None:
         policy.require_named(job, base)
     if job.capture.synthetic is not None:
         _prepare_synthetic(job, stated, overrides, prepare)
-    _require_plausible_calibrations(job, full, source)
+    _require_plausible_calibrations(job, source)
     if stated.uses_folder:
         job = job.model_copy(update={"capture": with_found_calibrations(job.capture, base)})
         if policy is not None:  # before a calibration is read
@@ -318,14 +341,14 @@ def _resolved_job(
     ]
     resolved = _with_resolved(job, cameras, stated, overrides)
     if policy is None:
-        _require_apart(resolved, full)
+        _require_apart(resolved, source.path)
     else:  # the folder of the results is not checked, because the operator chooses it
         policy.require_resolved(resolved)
     return LoadedJob(
         job=resolved,
         origins={camera.config.name: camera.origins for camera in cameras},
         folder=_capture_folder(stated, resolved),
-        job_file=None if source is None else full,
+        job_file=None if source.file is None else source.path,
         calibration_files=frozenset(
             camera.calibration_file for camera in cameras if camera.calibration_file is not None
         ),
@@ -344,8 +367,9 @@ def _resolved_job(
 def _capture_folder(stated: _StatedJob, resolved: Job) -> Path | None:
     """Return the folder of the videos; None if the job file lies elsewhere."""
     videos = [video for camera in resolved.capture.cameras for video in camera.video]
-    if stated.uses_folder or any(video.parent == stated.folder for video in videos):
-        return stated.folder
+    folder = stated.source.folder
+    if stated.uses_folder or any(video.parent == folder for video in videos):
+        return folder
     return None
 
 
@@ -360,7 +384,7 @@ def _reason_of_unlisted(stated: _StatedJob) -> str:
 
 def _calibration_warnings(stated: _StatedJob, cameras: Sequence[ResolvedCamera]) -> list[str]:
     """Return a warning if a calibration beside the job file is ignored although a camera has none."""
-    path = stated.folder / CALIBRATION_FILE
+    path = stated.source.folder / CALIBRATION_FILE
     if stated.uses_folder or stated.is_alone or not path.is_file():
         return []
     unstated = [camera.config.name for camera in cameras if camera.origins.calibration.source == "default"]
@@ -442,7 +466,7 @@ def _top_mapping(source: YamlSource) -> dict[str, Any]:
     return source.data
 
 
-def _with_folder_capture(data: dict[str, Any], folder: Path, places: Places) -> dict[str, Any]:
+def _with_folder_capture(data: dict[str, Any], folder: Path, overrides: Overrides) -> dict[str, Any]:
     """Return the data of a job file. If no cameras are listed, add the videos in the job file's folder.
 
     The cameras are named after these videos, as for a folder without a job file. Data with an unknown key are
@@ -459,11 +483,11 @@ def _with_folder_capture(data: dict[str, Any], folder: Path, places: Places) -> 
     except CaptureError:  # no videos here: the validation reports the missing cameras
         return data
     are_found = bool(capture.get("places"))
-    found = folder_capture(folder, lambda name: are_found or places.is_known(name))
+    found = folder_capture(folder, lambda name: are_found or overrides.is_known(name))
     return {**data, "capture": {**found, **capture}}
 
 
-def _validated(data: dict[str, Any], path: Path, source: YamlSource | None) -> Job:
+def _validated(data: dict[str, Any], source: _Source) -> Job:
     """Check the types strictly and return the job.
 
     The data are validated as JSON. A list is therefore accepted for a tuple, but the text "5" is not accepted
@@ -472,7 +496,7 @@ def _validated(data: dict[str, Any], path: Path, source: YamlSource | None) -> J
     try:
         return Job.model_validate_json(json.dumps(_with_lists(data)), strict=True)
     except ValidationError as error:
-        raise job_error(problems_of(error, Job, data), path, source) from error
+        raise source.error(problems_of(error, Job, data)) from error
 
 
 def _with_lists(data: dict[str, Any]) -> dict[str, Any]:
@@ -519,24 +543,24 @@ def _known_activity(text: str) -> Activity:
 
 
 def _prepare_synthetic(job: Job, stated: _StatedJob, overrides: Overrides, prepare: Prepare | None) -> None:
-    base, path = stated.folder, stated.path
+    base = stated.source.folder
     folder = synthetic_folder(job, base)
     if prepare is not None:
         options = dict(job.capture.synthetic or {})
         if isinstance(options.get("motion"), str):
             options["motion"] = str((base / options["motion"]).resolve())
-        prepare(options, folder, _out(path, stated.source, job.name, job.out, overrides))
+        prepare(options, folder, stated.source.results(job.name, job.out, overrides))
     missing = [v for camera in job.capture.cameras for v in camera.video if not (base / v).is_file()]
     if missing:
         raise CaptureError(
             "the videos of this synthetic capture have not been rendered yet",
             path=(base / missing[0]).resolve(),
             field="capture.synthetic",
-            hint=f"run `bodycap run {path.name}`, which renders the videos first",
+            hint=f"run `bodycap run {stated.source.path.name}`, which renders the videos first",
         )
 
 
-def _require_plausible_calibrations(job: Job, path: Path, source: YamlSource | None) -> None:
+def _require_plausible_calibrations(job: Job, source: _Source) -> None:
     """Refuse a job that contains a calibration with a value that no usable calibration has.
 
     Raises:
@@ -546,79 +570,32 @@ def _require_plausible_calibrations(job: Job, path: Path, source: YamlSource | N
     for index, camera in enumerate(job.capture.cameras):
         places.append((("capture", "cameras", index, "calibration"), camera.calibration))
     for place, calibration in places:
-        if not isinstance(calibration, Calibration):
-            continue
-        if (found := calibration.implausible_value()) is not None:
-            line = None if source is None else source.line_of((*place, found.field.partition(".")[0]))
-            raise implausible_calibration(found, path, dotted(place), line)
+        found = calibration.implausible_value() if isinstance(calibration, Calibration) else None
+        if found is not None:
+            field = found.field.partition(".")[0]
+            line = None if source.file is None else source.file.line_of((*place, field))
+            raise implausible_calibration(found, source.path, dotted(place), line)
 
 
 def _with_resolved(
     job: Job, cameras: Sequence[ResolvedCamera], stated: _StatedJob, overrides: Overrides
 ) -> Job:
-    skeleton, base = skeleton_of(job), stated.folder
+    source, skeleton = stated.source, skeleton_of(job)
     if skeleton not in SKELETON_PRESETS:
-        skeleton = str((base / skeleton).resolve())
+        skeleton = str((source.folder / skeleton).resolve())
         if not Path(skeleton).is_file():
-            raise job_error(
-                [
-                    Problem(
-                        ("skeleton",),
-                        f"there is no such skeleton file: {skeleton}",
-                        "correct the path of the skeleton; a relative path starts at the folder of "
-                        "the job file",
-                    )
-                ],
-                stated.path,
-                stated.source,
-            )
+            hint = "correct the path of the skeleton; a relative path starts at the folder of the job file"
+            raise source.error([Problem(("skeleton",), f"there is no such skeleton file: {skeleton}", hint)])
     configs = tuple(camera.config for camera in cameras)
     capture = job.capture.model_copy(update={"cameras": configs, "cameras_only": True, "calibration": None})
-    name = job.name or safe_name(_name(stated.path, stated.source))
-    out = _out(stated.path, stated.source, job.name, job.out, overrides)
-    return job.model_copy(update={"capture": capture, "name": name, "skeleton": skeleton, "out": out})
-
-
-def _mapping(source: YamlSource | None) -> Mapping[str, Any]:
-    """Return the data of a job file; empty if there is none, or if the data are no mapping."""
-    return source.data if source is not None and isinstance(source.data, dict) else {}
-
-
-def _stated_results(path: Path, source: YamlSource | None, overrides: Overrides) -> Path:
-    """Return the folder for the results of a job that is not validated yet."""
-    data = _mapping(source)
-    return _out(path, source, data.get("name"), data.get("out"), overrides)
-
-
-def _is_folder(path: Path, source: YamlSource | None) -> bool:
-    """Return True for a folder of videos, also with a ``job.yaml`` in it."""
-    return source is None or path.name in JOB_FILES
-
-
-def _name(path: Path, source: YamlSource | None) -> str:
-    """Return the name of a job if its job file gives none."""
-    folder = path if source is None else path.parent
-    return folder.name if _is_folder(path, source) else path.stem
-
-
-def _out(path: Path, source: YamlSource | None, name: Any, out: Any, overrides: Overrides) -> Path:
-    """Return the folder for the results of a job. It does not depend on the working folder.
-
-    Args:
-        path: The job file, or the folder of videos.
-        source: The parsed job file; None for a folder of videos.
-        name: Name of the job in the job file; of another type or empty if it gives none.
-        out: Folder for the results in the job file; of another type if it gives none.
-        overrides: Values of the command line.
-    """
-    folder = path if source is None else path.parent
-    if overrides.out is not None:
-        return overrides.out.resolve()
-    if isinstance(out, Path) or _is_path_text(out):
-        return (folder / out).resolve()
-    own = (folder.parent if _is_folder(path, source) else folder) / RESULTS
-    named = name if _is_path_text(name) and name else safe_name(_name(path, source))
-    return ((overrides.out_parent or own) / named).resolve()
+    return job.model_copy(
+        update={
+            "capture": capture,
+            "name": job.name or source.name,
+            "skeleton": skeleton,
+            "out": source.results(job.name, job.out, overrides),
+        }
+    )
 
 
 def _is_path_text(value: object) -> TypeGuard[str]:
@@ -645,4 +622,4 @@ def _require_apart(job: Job, full: Path) -> None:
 
 def safe_name(text: str) -> str:
     """Convert a text to a file name that consists of letters, digits, ``.``, ``_`` and ``-`` only."""
-    return re.sub(r"[^A-Za-z0-9._\-]+", "_", text)[:_NAME_LENGTH].strip("._-") or "job"
+    return re.sub(r"[^A-Za-z0-9._\-]+", "_", text)[:MAX_NAME_LENGTH].strip("._-") or "job"

@@ -9,7 +9,7 @@ import difflib
 import gzip
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
@@ -17,15 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from bodycap_batch.config.bounds import ASPECT_TOLERANCE
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX, Camera, with_two_focal_lengths
 
 NAME_SEPARATOR = " / "
 """Separates the parts of a name: model, lens mode, size."""
 _PACKAGE, _TABLE = "bodycap_batch.presets.lenses", "profiles.json.gz"
-_ASPECT_TOLERANCE = 0.004
-"""Maximum relative difference between two aspect ratios that are treated as equal. Origin: image sizes are
-rounded to even numbers."""
 _RATE_TOLERANCE = 0.01
 """Maximum relative difference between two frame rates that are treated as equal: 29.97 and 30."""
 _COMPARED_RAD = (0.1, 0.5)
@@ -116,7 +114,7 @@ class LensProfile:
         """
         if size in ((self.width, self.height), *self.sizes):
             return True
-        same_shape = abs(size[0] * self.height / (size[1] * self.width) - 1.0) <= _ASPECT_TOLERANCE
+        same_shape = abs(size[0] * self.height / (size[1] * self.width) - 1.0) <= ASPECT_TOLERANCE
         return same_shape and not exactly
 
     def place_of(self, angle_rad: float) -> float:
@@ -197,36 +195,21 @@ def lens_profiles() -> tuple[LensProfile, ...]:
     """Return all profiles of the table."""
     packed = resources.files(_PACKAGE).joinpath(_TABLE).read_bytes()
     table = json.loads(gzip.decompress(packed))
-    columns = {name: index for index, name in enumerate(table["columns"])}
+    found = (dict(zip(table["columns"], row, strict=True)) for row in table["rows"])
+    return tuple(map(_profile, found))
 
-    def of(row: list[Any], *names: str) -> list[Any]:
-        return [row[columns[name]] for name in names]
 
-    out = []
-    for row in table["rows"]:
-        brand, model, lens, setting, width, height, fps = row[:7]
-        rms_px, official, stabilised, anamorphic, readout_ms = of(
-            row, "rms_px", "official", "stabilised", "anamorphic", "readout_ms"
-        )
-        out.append(
-            LensProfile(
-                brand=brand,
-                model=model,
-                lens=lens,
-                setting=setting,
-                width=width,
-                height=height,
-                fps=fps,
-                params=tuple(of(row, "fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
-                rms_px=rms_px,
-                official=bool(official),
-                stabilised=bool(stabilised),
-                anamorphic=bool(anamorphic),
-                readout_s=1e-3 * readout_ms or None,
-                sizes=tuple((each[0], each[1]) for each in row[columns["sizes"]]),
-            )
-        )
-    return tuple(out)
+def _profile(row: Mapping[str, Any]) -> LensProfile:
+    plain = ("brand", "model", "lens", "setting", "width", "height", "fps", "rms_px")
+    return LensProfile(
+        **{name: row[name] for name in plain},
+        params=tuple(row[name] for name in ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
+        official=bool(row["official"]),
+        stabilised=bool(row["stabilised"]),
+        anamorphic=bool(row["anamorphic"]),
+        readout_s=1e-3 * row["readout_ms"] or None,
+        sizes=tuple((width, height) for width, height in row["sizes"]),
+    )
 
 
 def search_lenses(words: str) -> list[LensProfile]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -46,6 +46,9 @@ former name, which stays valid."""
 _MAX_ROTATION = 10.0
 """Maximum absolute value (no unit) of a component of a rotation that the job gives, as a quaternion or as a
 matrix. The bound keeps products finite; `rules` checks that the components are a rotation. Evidence: none."""
+MAX_NAME_LENGTH = 100
+"""Maximum number of characters of a job's name. The name of a folder that names a job is shortened to it.
+Evidence: none."""
 _MAX_FRAME = 10**8
 """Maximum number of a frame of a skeleton file: a day of motion at the maximum rate has 86 million frames."""
 
@@ -116,6 +119,10 @@ AnyPose = Annotated[
     Annotated[MountPose, Tag("parts")] | Annotated[tuple[Row, Row, Row, Row], Tag("matrix")],
     Discriminator(_pose_kind),
 ]
+
+
+_FILE_FIELDS = ("video", "timestamps", "calibration", "samples", "mask")
+"""Names of the fields of a camera that hold paths."""
 
 
 class CameraConfig(_Block):
@@ -226,6 +233,24 @@ class CameraConfig(_Block):
             return make_transform(rotation_from_quat_xyzw(pose.quat_xyzw), pose.translation_m)
         return None if pose is None else np.array(pose, dtype=np.float64)
 
+    def files(self) -> Iterator[tuple[str, Path]]:
+        """Yield the name of the field and the path of each file or folder that the camera names."""
+        for field in _FILE_FIELDS:
+            value = getattr(self, field)
+            paths = value if isinstance(value, tuple) else (value,)
+            yield from ((field, path) for path in paths if isinstance(path, Path))
+
+    def with_paths(self, change: Callable[[Path], Path]) -> CameraConfig:
+        """Return the camera with each of its paths replaced by `change(path)`."""
+        update: dict[str, Path | tuple[Path, ...]] = {}
+        for field in _FILE_FIELDS:
+            value = getattr(self, field)
+            if isinstance(value, Path):
+                update[field] = change(value)
+            elif isinstance(value, tuple):
+                update[field] = tuple(map(change, value))
+        return self.model_copy(update=update)
+
     def input_files(self) -> tuple[Path, ...]:
         """Return the files that the camera's frames and times depend on."""
         return (*self.video, *self.timestamps, *(() if self.mask is None else (self.mask,)))
@@ -310,7 +335,7 @@ class Job(_Block):
     capture: CaptureConfig
     name: str = Field(
         "",
-        max_length=100,
+        max_length=MAX_NAME_LENGTH,
         description="name of the job and its results; default: the name of the job file or the folder",
     )
     out: Path | None = Field(
@@ -359,6 +384,24 @@ class Job(_Block):
         "the measured joints, rest: they are held in the rest pose, none: they are left out of the files",
     )
     export: ExportOptions = ExportOptions()
+
+    def files(self) -> Iterator[tuple[tuple[str | int, ...], Path]]:
+        """Yield the location in the job and the path of each file or folder that the job names."""
+        if self.skeleton is not None and self.skeleton not in SKELETON_PRESETS:
+            yield ("skeleton",), Path(self.skeleton)
+        if isinstance(self.capture.calibration, Path):
+            yield ("capture", "calibration"), self.capture.calibration
+        for index, camera in enumerate(self.capture.cameras):
+            yield from ((("capture", "cameras", index, field), path) for field, path in camera.files())
+
+    def with_paths(self, change: Callable[[Path], Path]) -> Job:
+        """Return a resolved job with each path replaced by `change(path)`, and without an output folder."""
+        cameras = tuple(camera.with_paths(change) for camera in self.capture.cameras)
+        capture = self.capture.model_copy(update={"cameras": cameras})
+        skeleton = self.skeleton
+        if skeleton is not None and skeleton not in SKELETON_PRESETS:
+            skeleton = str(change(Path(skeleton)))
+        return self.model_copy(update={"capture": capture, "skeleton": skeleton, "out": None})
 
     def with_places(self, places: Mapping[str, str]) -> Job:
         """Return the job in which each camera without a place has the place that was found from the motion.

@@ -164,11 +164,7 @@ class LoadedJob:
         return tuple(found)
 
     def _used_files(self) -> frozenset[Path]:
-        cameras = self.job.capture.cameras
-        files = {real_path(path) for camera in cameras for path in camera.input_files()}
-        files |= {real_path(camera.samples) for camera in cameras if camera.samples is not None}
-        if self.job.skeleton is not None:
-            files.add(real_path(Path(self.job.skeleton)))
+        files = {real_path(path) for _, path in self.job.files()}
         if self.job_file is not None:
             files.add(real_path(self.job_file))
         return frozenset(files | self.calibration_files)

@@ -7,7 +7,7 @@ with the height of a mean adult.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +16,10 @@ import yaml
 from pydantic import BaseModel, ConfigDict
 
 from bodycap_batch.config.folder import JOB_FILES, PARTIAL, RUN_FILE
-from bodycap_batch.config.models import Job
+from bodycap_batch.config.models import CameraConfig, Job
+from bodycap_batch.config.mounts import MOUNT_NAMES, mount_of
+from bodycap_batch.config.origins import Source
+from bodycap_batch.core.errors import JobError
 from bodycap_batch.store.checked_json import parse_checked_json
 
 COMMAND_LINE = "command_line"
@@ -80,6 +83,48 @@ class Overrides:
     places: tuple[str, ...] = ()
     require: str | None = None
 
+    def place_of(self, camera: CameraConfig) -> tuple[str, Source] | None:
+        """Return the place that is given for a camera, and where it comes from; None if none is given."""
+        names = (camera.name, *(video.name for video in camera.video))
+        if (place := _place_of(names, self.mounts)) is not None:
+            return place, "command line"
+        is_stated = camera.mount is not None or camera.segment is not None
+        place = None if is_stated else _place_of(names, self.last_mounts)
+        return None if place is None else (place, "last run")
+
+    def is_known(self, name: str) -> bool:
+        """Return True if the place of a video is given or found later, or if its name contains the place."""
+        given = _place_of((name,), self.mounts) or _place_of((name,), self.last_mounts)
+        return bool(self.places) or given is not None or mount_of(name) is not None
+
+    def mounted(self, camera: CameraConfig) -> CameraConfig:
+        """Return a camera with the place that is given for it, or unchanged.
+
+        Raises:
+            JobError: The place is unknown.
+        """
+        given = self.place_of(camera)
+        if given is None:
+            return camera
+        place, _ = given
+        if mount_of(place) is None:
+            raise JobError(
+                f"there is no place {place[:40]!r} on the body",
+                field="--camera",
+                hint=f"use one of {', '.join(MOUNT_NAMES)}",
+            )
+        return camera.model_copy(update={"mount": place, "mount_source": None, "segment": None})
+
+    def require_used(self, cameras: Sequence[CameraConfig]) -> None:
+        """Check that each name in `mounts` belongs to a camera. Raises `JobError`."""
+        for name in self.mounts:
+            if not any(Overrides(mounts={name: ""}).place_of(camera) is not None for camera in cameras):
+                raise JobError(
+                    f"there is no camera {name[:40]!r}",
+                    field="--camera",
+                    hint=f"use one of these names: {', '.join(camera.name for camera in cameras)}",
+                )
+
     def with_last_run(self, stated: Mapping[str, Any], results: Path) -> tuple[Overrides, str]:
         """Add the values of the last run, and return a sentence about them; "" if none is added.
 
@@ -130,3 +175,16 @@ def values_to_record(job: Job, overrides: Overrides, results: Path) -> dict[str,
         places=overrides.places or (last.places if is_found else ()),
     )
     return kept.model_dump(mode="json", exclude_none=True)
+
+
+def _place_of(names: Sequence[str], by_name: Mapping[str, str]) -> str | None:
+    """Return the place that is given for one of the names of a camera; None if none is given."""
+    found = (place for name in names for given, place in by_name.items() if _is_same(given, name))
+    return next(found, None)
+
+
+def _is_same(given: str, name: str) -> bool:
+    """Return True if two names are equal regardless of upper and lower case and of the suffix of a video."""
+    return (
+        given.lower() in (name.lower(), Path(name).stem.lower()) or Path(given).stem.lower() == name.lower()
+    )

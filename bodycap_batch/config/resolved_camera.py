@@ -117,10 +117,10 @@ def resolved_camera(
         samples=_file_origin(
             () if config.samples is None else (config.samples,), is_stated=camera.samples is not None
         ),
-        clock_offset=Origin(source="job file", value=f"{camera.offset_s:g} s")
-        if camera.offset_s is not None
-        else _offset_origin(camera, entry, file, capture, is_stated=is_stated),
-        clock_drift=_drift_origin(camera, capture),
+        clock_offset=_offset_in_file(entry, file, is_stated=is_stated)
+        if camera.offset_s is None and entry is not None and entry.offset_s is not None
+        else _clock_origin(camera, capture, camera.offset_s, "s"),
+        clock_drift=_clock_origin(camera, capture, camera.drift_ppm, "ppm"),
         mount=_mount_origin(config, capture.places, placed.get(config.name, "job file")),
         mount_pose=Origin(source="default", value="typical of the place")
         if camera.joint_from_cam is None
@@ -154,41 +154,29 @@ def _file_origin(files: tuple[Path, ...], *, is_stated: bool) -> Origin | None:
     return Origin(source=source, value=_file_names(files)) if files else None
 
 
-def _offset_origin(
-    camera: CameraConfig,
-    entry: CalibrationEntry | None,
-    file: Path | None,
-    capture: CaptureConfig,
-    *,
-    is_stated: bool,
-) -> Origin:
-    """Return the origin of a clock offset that the job file does not give.
-
-    Args:
-        camera: The camera as the job states it.
-        entry: The entry of the camera in the calibration file; None without such a file.
-        file: The calibration file.
-        capture: The capture, which says whether all clocks agree.
-        is_stated: True if the job file names this file.
-    """
-    if entry is None or file is None or entry.offset_s is None:
-        if capture.clocks == "common":
-            return Origin(source="job file", value="0 s, common clocks")
-        is_reference = capture.reference_camera().name == camera.name
-        return Origin(source="default", value="0 s, the reference clock" if is_reference else "auto")
-    if is_stated:
+def _offset_in_file(entry: CalibrationEntry, file: Path | None, *, is_stated: bool) -> Origin:
+    """Return the origin of a clock offset in a calibration file, which the job may name."""
+    if is_stated and file is not None:
         return Origin(source="job file", value=f"{entry.offset_s:g} s in {file.name}")
     return Origin(source="calib.json", value=f"{entry.offset_s:g} s")
 
 
-def _drift_origin(camera: CameraConfig, capture: CaptureConfig) -> Origin:
-    """Return the origin of the drift of a camera's clock."""
-    if camera.drift_ppm is not None:
-        return Origin(source="job file", value=f"{camera.drift_ppm:g} ppm")
+def _clock_origin(camera: CameraConfig, capture: CaptureConfig, stated: float | None, unit: str) -> Origin:
+    """Return the origin of the offset or the drift of a camera's clock.
+
+    Args:
+        camera: The camera as the job states it.
+        capture: The capture, which says whether all clocks agree.
+        stated: The value that the job states; None if it states none.
+        unit: Unit of the value.
+    """
+    if stated is not None:
+        return Origin(source="job file", value=f"{stated:g} {unit}")
     if capture.clocks == "common":
-        return Origin(source="job file", value="0 ppm, common clocks")
-    is_reference = capture.reference_camera().name == camera.name
-    return Origin(source="default", value="0 ppm" if is_reference else "auto")
+        return Origin(source="job file", value=f"0 {unit}, common clocks")
+    if capture.reference_camera().name != camera.name:
+        return Origin(source="default", value="auto")
+    return Origin(source="default", value="0 s, the reference clock" if unit == "s" else f"0 {unit}")
 
 
 def _mount_origin(config: CameraConfig, places: Sequence[str], stated_in: Source) -> Origin:

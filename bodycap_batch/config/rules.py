@@ -48,7 +48,7 @@ def problems_in(job: Job) -> list[Problem]:
     for index, camera in enumerate(job.capture.cameras):
         for found in (*_camera_names(job, index), *_mount(job, camera), *_pose(camera), *_paths(camera)):
             problems.append(found._replace(location=("capture", "cameras", index, *found.location)))
-    rules = (_job_names, _skeleton, _size, _times, _named_frames, _places, _rig, _board)
+    rules = (_job_names, _files, _skeleton, _size, _times, _named_frames, _places, _rig, _board)
     return [*problems, *(found for rule in rules for found in rule(job))]
 
 
@@ -147,31 +147,20 @@ def _paths(camera: CameraConfig) -> Iterator[Problem]:
         if str(video) == _UNKNOWN_VIDEO:
             message = f"the path of the video is not filled in: {video}"
             yield Problem(("video",), message, "write the path of your video here")
-        yield from _unusable("video", video)
-    for path in camera.timestamps:
-        yield from _unusable("timestamps", path)
-    if isinstance(camera.calibration, Path):
-        yield from _unusable("calibration", camera.calibration)
-    if camera.samples is not None:
-        yield from _unusable("samples", camera.samples)
-    if camera.mask is not None:
-        yield from _unusable("mask", camera.mask)
     if len(set(camera.video)) < len(camera.video):
         yield Problem(("video",), "a chapter is listed twice", "list each file once")
 
 
-def _unusable(field: str, path: Path) -> Iterator[Problem]:
-    """Yield a problem if common file systems do not accept the path `path` of the job's field `field`."""
-    if "\0" in str(path) or any(len(part.encode(errors="replace")) > _MAX_NAME_BYTES for part in path.parts):
-        yield Problem((field,), f"{str(path)[:40]!r} cannot be a path", "correct the path")
+def _files(job: Job) -> Iterator[Problem]:
+    """Yield a problem for each path that common file systems do not accept."""
+    out = [] if job.out is None else [(("out",), job.out)]
+    for where, path in (*out, *job.files()):
+        is_long = any(len(part.encode(errors="replace")) > _MAX_NAME_BYTES for part in path.parts)
+        if "\0" in str(path) or is_long:
+            yield Problem(where, f"{str(path)[:40]!r} cannot be a path", "correct the path")
 
 
 def _job_names(job: Job) -> Iterator[Problem]:
-    if job.out is not None:
-        yield from _unusable("out", job.out)
-    if isinstance(job.capture.calibration, Path):
-        for found in _unusable("calibration", job.capture.calibration):
-            yield found._replace(location=("capture", *found.location))
     if job.name and not _NAME.fullmatch(job.name):
         yield Problem(("name",), f"{job.name!r} cannot be a folder's name", _NAME_CHARACTERS)
 
@@ -183,8 +172,6 @@ def _skeleton(job: Job) -> Iterator[Problem]:
         yield Problem(
             ("skeleton",), f"there is no skeleton {value!r}", f"{hint}; or give the path of a .bvh file"
         )
-    elif value is not None:
-        yield from _unusable("skeleton", Path(value))
     roles = {camera.role for camera in job.capture.worn()}
     if skeleton_of(job) != NO_SKELETON and not roles:
         yield Problem(
@@ -278,19 +265,8 @@ def missing_files(job: Job, base: Path) -> list[Problem]:
         job: The job.
         base: Folder to which the paths of the job are relative.
     """
-    found = []
-    for index, camera in enumerate(job.capture.cameras):
-        named = [("video", path) for path in camera.video] + [
-            ("timestamps", path) for path in camera.timestamps
-        ]
-        named += [("samples", camera.samples)] if camera.samples is not None else []
-        named += [("mask", camera.mask)] if camera.mask is not None else []
-        named += [("calibration", camera.calibration)] if isinstance(camera.calibration, Path) else []
-        for field, path in named:
-            if not _exists(base / path):
-                where = ("capture", "cameras", index, field)
-                found.append(Problem(where, f"there is no such file: {base / path}", "correct the path"))
-    return found
+    missing = [(where, base / path) for where, path in job.files() if not _exists(base / path)]
+    return [Problem(where, f"there is no such file: {path}", "correct the path") for where, path in missing]
 
 
 def _exists(path: Path) -> bool:

@@ -7,11 +7,11 @@ below the folders that the operator opened to all jobs. No other files are allow
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from bodycap_batch.config.models import SKELETON_PRESETS, CaptureConfig, Job
+from bodycap_batch.config.models import Job
+from bodycap_batch.config.yaml_source import dotted
 from bodycap_batch.core.errors import JobError
 
 
@@ -38,7 +38,8 @@ class PathPolicy:
             JobError: A path contains ``..``, or a path leads outside the allowed folders, directly or through
                 a symbolic link.
         """
-        for field, path in _paths_of(job):
+        for place, path in job.files():
+            field = dotted(place)
             if ".." in path.parts:
                 raise JobError(
                     f"the path {path} is not permitted, because `..` may lead out of the folder of the job",
@@ -53,8 +54,8 @@ class PathPolicy:
         Raises:
             JobError: A file is outside the allowed folders, for example because of a symbolic link.
         """
-        for field, path in _paths_of(job):
-            self.require(path, field)
+        for place, path in job.files():
+            self.require(path, dotted(place))
 
     def require(self, path: Path, field: str | None = None) -> None:
         """Check one path; symbolic links are followed.
@@ -89,25 +90,3 @@ class PathPolicy:
             else "or ask the operator to open the folder of the file with --root"
         )
         return f"{where}; {also}"
-
-
-def _paths_of(job: Job) -> Iterator[tuple[str, Path]]:
-    """Yield every path that a job reads, as a pair (field, path)."""
-    if job.skeleton is not None and job.skeleton not in SKELETON_PRESETS:
-        yield "skeleton", Path(job.skeleton)
-    yield from _paths_of_capture(job.capture)
-
-
-def _paths_of_capture(capture: CaptureConfig) -> Iterator[tuple[str, Path]]:
-    if isinstance(capture.calibration, Path):
-        yield "capture.calibration", capture.calibration
-    for index, camera in enumerate(capture.cameras):
-        here = f"capture.cameras.{index}"
-        yield from ((f"{here}.video", path) for path in camera.video)
-        yield from ((f"{here}.timestamps", path) for path in camera.timestamps)
-        if isinstance(camera.calibration, Path):
-            yield f"{here}.calibration", camera.calibration
-        if camera.samples is not None:
-            yield f"{here}.samples", camera.samples
-        if camera.mask is not None:
-            yield f"{here}.mask", camera.mask

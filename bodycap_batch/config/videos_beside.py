@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,7 +21,6 @@ from bodycap_batch.config.folder import (
 )
 from bodycap_batch.config.models import CameraConfig
 from bodycap_batch.config.mounts import mount_of
-from bodycap_batch.config.places import Places
 from bodycap_batch.config.unfinished_videos import refuse_missing_cameras, unreadable_videos
 from bodycap_batch.core.errors import CaptureError
 
@@ -63,7 +62,7 @@ class VideosBeside:
 
 
 def find_videos_beside(
-    job_file: Path, listed: Sequence[CameraConfig], places: Places | None = None
+    job_file: Path, listed: Sequence[CameraConfig], is_known: Callable[[str], bool]
 ) -> VideosBeside:
     """Find the videos in the folder of a job file that no camera of the job file lists.
 
@@ -74,7 +73,8 @@ def find_videos_beside(
     Args:
         job_file: The job file.
         listed: The cameras of the job file. Their paths are relative to the folder of the job file.
-        places: The places on the body that the command line gives; None if it gives none.
+        is_known: Function that returns True if the place of a video on the body is known. Its argument is the
+            name of the video.
 
     Raises:
         CaptureError: The folder cannot be read. Or a symbolic link to a video leads nowhere, and its name is
@@ -104,7 +104,7 @@ def find_videos_beside(
         advice = f"list it under `cameras:` in {job_file.name}, or state `cameras_only: true`"
         if str(block["name"]).lower() in names:
             found.leave_out(paths, f"camera {block['name']} of {job_file.name} lists another video", advice)
-        elif not (places or Places()).is_known(name):
+        elif not is_known(name):
             reason = "the name is not a known place on the body"
             found.leave_out(paths, reason, f"rename it (for example to left_palm.mp4), {advice}")
         else:

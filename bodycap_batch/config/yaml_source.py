@@ -16,9 +16,9 @@ from bodycap_batch.core.errors import JobError
 from bodycap_batch.core.text_encoding import decode_text
 
 MAX_BYTES = 1 << 20
-"""Maximum size (bytes) of a job file. Evidence: none."""
+"""Maximum size (bytes) of a job file or a calibration file. Real files: some kilobytes. Evidence: none."""
 MAX_DEPTH = 20
-"""Maximum nesting depth (levels) of a job file. A job needs six levels. Evidence: none."""
+"""Maximum nesting depth (levels) of a job or a calibration file. Both need six levels. Evidence: none."""
 
 Location = tuple[str | int, ...]
 """Location of a value: the keys and list positions from the top of the file, such as

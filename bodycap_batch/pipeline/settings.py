@@ -8,10 +8,9 @@ from pathlib import Path
 
 from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.overrides import Overrides
-from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.core.progress import Listener
 from bodycap_batch.runner import CHILD_COMMAND, Children, Executor, Rules, Runner, Task
-from bodycap_batch.runner.child_pool import STOPPED
+from bodycap_batch.runner.child_pool import stopped
 from bodycap_batch.runner.task_runner import allow
 from bodycap_batch.runner.turns import Turns, TurnTakingExecutor
 from bodycap_batch.store.artefacts import Store
@@ -99,7 +98,7 @@ class Settings:
     def raise_if_cancelled(self) -> None:
         """Raise `Cancelled` if the job must stop."""
         if self.cancelled():
-            raise Cancelled(STOPPED, hint="run the job again to continue")
+            raise stopped()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

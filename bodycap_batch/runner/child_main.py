@@ -32,11 +32,13 @@ from bodycap_batch.core.errors import (
 from bodycap_batch.core.mechanisms import acted, begin_task
 from bodycap_batch.core.memory import exempt_from_collection, release_memory
 from bodycap_batch.core.progress import StepProgress
+from bodycap_batch.runner.child_process import KILL_AFTER_S
 from bodycap_batch.runner.memory_limit import (
     is_out_of_memory,
     lift_own_limit,
     limit_own_memory,
     out_of_memory,
+    status_mb,
 )
 from bodycap_batch.runner.task import Task, TaskFunction, task_from_json
 from bodycap_batch.store.artefacts import DISK_ERRORS, Store, store_error
@@ -44,10 +46,6 @@ from bodycap_batch.store.artefacts import DISK_ERRORS, Store, store_error
 _PROGRESS_PERIOD_S = 0.2
 """Minimum time (seconds) between two reports of progress. A display that changes faster is hard to read.
 Evidence: none."""
-_GRACE_S = 3.0
-"""Time (seconds) that a stage has to stop by itself after the parent has closed standard input. When this
-time is over, the child kills itself. The parent waits equally long (`child_process.KILL_AFTER_S`). Evidence:
-none."""
 RELEASE_PERIOD_S = 0.5
 """Minimum time (seconds) between two releases of freed memory. In a process with much memory, one release
 takes about 50 ms. Evidence: docs/decisions/pipeline.md."""
@@ -59,10 +57,9 @@ reported as the cause of the failure, because libraries hide the error ENOSPC. E
 def main(arguments: Sequence[str], stages: Mapping[str, TaskFunction]) -> int:
     """Run the task file given in `arguments`; without a file, follow orders until standard input closes.
 
-    An order is one JSON line. ``{"task": task, "log": file, "memory_mb": limit, "limit_yourself": true}``
-    runs a task and writes the task's printed output to the log. If ``limit_yourself`` is false, the parent
-    limits the memory of the child. ``{"import": [modules]}`` loads modules while the child has no task. If a
-    task is ordered while modules are loading, the task waits until the modules are loaded.
+    An order is one JSON line. ``{"task": task, "log": file, "memory_mb": limit}`` runs a task and writes the
+    task's printed output to the log. ``{"import": [modules]}`` loads modules while the child has no task. If
+    a task is ordered while modules are loading, the task waits until the modules are loaded.
 
     Args:
         arguments: The path of the task file; empty to follow orders.
@@ -82,9 +79,7 @@ def main(arguments: Sequence[str], stages: Mapping[str, TaskFunction]) -> int:
             continue
         _redirect_prints(Path(order["log"]))
         writer.send("started")
-        parent = _Parent(
-            writer, orders, asks=True, memory_mb=order["memory_mb"], limits_itself=order["limit_yourself"]
-        )
+        parent = _Parent(writer, orders, asks=True, memory_mb=order["memory_mb"])
         if _run_task(order["task"], stages, parent) == EXIT_BUG:
             return EXIT_BUG
     return 0
@@ -99,14 +94,12 @@ class _Parent:
         orders: Reader of the parent's orders and answers.
         asks: True if the child asks the parent for permission before a commit.
         memory_mb: Memory limit (MB) of the task; None for no limit.
-        limits_itself: True if the child limits its own memory, and not the parent.
     """
 
     messages: _MessageWriter
     orders: _OrderReader
     asks: bool
     memory_mb: int | None = None
-    limits_itself: bool = False
 
     def before_commit(self) -> None:
         """Ask the parent whether the artefact may be committed; raise `Cancelled` if the parent refuses."""
@@ -126,7 +119,7 @@ def _run_task(document: Mapping[str, Any], stages: Mapping[str, TaskFunction], p
     task, root = task_from_json(document)
     try:
         store = Store(root)
-        if parent.memory_mb is not None and parent.limits_itself:
+        if parent.memory_mb is not None:
             limit_own_memory(parent.memory_mb, task.threads)
         _run(task, store, stages[task.key.stage], parent)
     except Exception as error:  # noqa: BLE001 - the only place that catches the bugs of a task
@@ -274,10 +267,8 @@ def _reset_peak_memory() -> None:
 
 def peak_memory_mb() -> float:
     """Return the peak resident memory (MB) since `_reset_peak_memory`, or since the start without a reset."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 1024.0
+    if peak_mb := status_mb("self", "VmHWM"):
+        return peak_mb
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1 << 20) if sys.platform == "darwin" else peak / (1 << 10)
 
@@ -349,7 +340,7 @@ class _OrderReader:
     """Reads the orders from standard input, and ends the process some time after standard input closes.
 
     Standard input closes if the parent asks the child to stop, or if the parent has ended. The process kills
-    itself `_GRACE_S` later.
+    itself `KILL_AFTER_S` later.
     """
 
     def __init__(self) -> None:
@@ -369,5 +360,5 @@ class _OrderReader:
                 self._queue.put(json.loads(line))
         self.closed.set()
         self._queue.put(None)
-        time.sleep(_GRACE_S)
+        time.sleep(KILL_AFTER_S)
         os.kill(os.getpid(), signal.SIGKILL)

@@ -21,7 +21,14 @@ from bodycap_batch.store.artefacts import Store, disk_errors
 
 CHILDREN_LOG = "children.log"
 """Name of the log file for the output that children print while they have no task."""
-STOPPED = "the job stopped on request; the results of finished stages stay in the store"
+
+
+def stopped() -> Cancelled:
+    """Return the error for a job that was stopped."""
+    return Cancelled(
+        "the job stopped on request; the results of finished stages stay in the store",
+        hint="run the job again to continue",
+    )
 
 
 def do_nothing() -> None:
@@ -159,14 +166,14 @@ class Children:
             log.with_suffix(".task.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
             log.write_bytes(b"")
         child, last = self._run_in_child(task, environment, {"task": document, "log": str(log)})
-        stopped = environment.cancelled()
-        if last is not None and "ends" not in last and not stopped:
+        is_stopped = environment.cancelled()
+        if last is not None and "ends" not in last and not is_stopped:
             with self._lock:
                 self._idle.append(child)
         else:
-            child.end(at_once=stopped)
-        if stopped:
-            raise Cancelled(STOPPED, hint="run the job again to continue")
+            child.end(at_once=is_stopped)
+        if is_stopped:
+            raise stopped()
         if last is None or last["event"] == "error":
             raise _task_error(task, last, child, log, environment)
 
@@ -202,8 +209,8 @@ class Children:
                 on_error.callback(child.end, at_once=True)
                 load_ahead("")
                 memory_mb = environment.memory_limit_mb
-                limit_yourself = child.limit_memory(memory_mb)
-                child.order({**order, "memory_mb": memory_mb, "limit_yourself": limit_yourself})
+                child.limit_memory(memory_mb)
+                child.order({**order, "memory_mb": memory_mb})
                 last = child.follow(environment.cancelled, receive)
                 on_error.pop_all()
             if is_new or events or last is not None or environment.cancelled():

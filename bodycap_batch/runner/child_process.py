@@ -14,15 +14,16 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import bodycap_batch
-from bodycap_batch.runner.memory_limit import MemoryGroup, kernel_kills, resident_mb
+from bodycap_batch.runner.memory_limit import kernel_kills, status_mb
 
 CHILD_COMMAND = (sys.executable, "-P", "-m", "bodycap_batch.tasks")
 """Command line of a child, without the task file. The command names the package `tasks`, which belongs to a
 higher layer. The package `runner` must not import the package `tasks`."""
 KILL_AFTER_S = 3.0
-"""Time (seconds) that a child has to end by itself before it is killed. Evidence: none."""
-_POLL_S = 0.2
-"""Time (seconds) between two checks by the parent whether the job was stopped. Evidence: none."""
+"""Time (seconds) that a child has to end by itself. Then its parent kills it, or it kills itself if its
+parent has ended. Evidence: none."""
+POLL_S = 0.2
+"""Time (seconds) between two checks whether a job that waits was stopped. Evidence: none."""
 _THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -52,8 +53,7 @@ class Child:
         self._incomplete = b""
         self.peak_mb = 0.0
         self._memory_mb = 0
-        self._group = MemoryGroup.create(self._process.pid)
-        self._kills_before = self._kills_after = (0, 0)
+        self._kills_before = self._kills_after = 0
         self._exceeded = False
 
     @property
@@ -61,27 +61,21 @@ class Child:
         """Exit code of a child that has ended; the negative signal number if a signal ended it."""
         return self._process.returncode
 
-    def limit_memory(self, memory_mb: int) -> bool:
-        """Limit the resident memory of the next task; return True if the child must limit itself, too."""
+    def limit_memory(self, memory_mb: int) -> None:
+        """Limit the resident memory of the next task."""
         self._memory_mb, self.peak_mb, self._exceeded = memory_mb, 0.0, False
-        if self._group is not None and not self._group.limit(memory_mb):
-            self._group = None
-        self._kills_before = self._kills()
-        return self._group is None
+        self._kills_before = kernel_kills()
 
     def ended_by_memory(self) -> bool:
         """Return True if the limit or the kernel ended this child, because of its memory."""
         killed = self.returncode == -signal.SIGKILL
         return self._exceeded or (killed and self._kills_after != self._kills_before)
 
-    def _kills(self) -> tuple[int, int]:
-        return kernel_kills(), 0 if self._group is None else self._group.kills()
-
     def _check_memory(self) -> bool:
         """Note the resident memory. If it is above the limit, kill the child and return False."""
-        now = resident_mb(self._process.pid)
+        now = status_mb(self._process.pid, "VmRSS")
         self.peak_mb = max(self.peak_mb, now)
-        if self._group is None and now > self._memory_mb > 0:
+        if now > self._memory_mb > 0:
             self._exceeded = True
             self._signal(signal.SIGKILL)
             return False
@@ -109,7 +103,7 @@ class Child:
         assert self._process.stdout is not None
         pipe = self._process.stdout.fileno()
         while not cancelled():
-            ready = select.select([pipe], [], [], _POLL_S)[0]
+            ready = select.select([pipe], [], [], POLL_S)[0]
             if not self._check_memory():
                 return None
             if not ready:
@@ -141,9 +135,7 @@ class Child:
             self._signal(signal.SIGKILL)
             self._process.wait()
         self._process.stdout.close()
-        self._kills_after = self._kills()
-        if self._group is not None:
-            self._group.remove()
+        self._kills_after = kernel_kills()
 
     def kill(self) -> None:
         """Kill a child that has no task. No results can be lost."""

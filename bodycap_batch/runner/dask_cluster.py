@@ -18,9 +18,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bodycap_batch.core.errors import BodycapError, Cancelled, JobError, StoreError, error_from_dict
+from bodycap_batch.core.errors import BodycapError, JobError, StoreError, error_from_dict
 from bodycap_batch.runner import CHILD_COMMAND, Task, TaskEnvironment
-from bodycap_batch.runner.child_pool import STOPPED
+from bodycap_batch.runner.child_pool import stopped
+from bodycap_batch.runner.child_process import POLL_S
 from bodycap_batch.runner.remote import remote_order, run_order
 from bodycap_batch.runner.turns import Turns
 
@@ -32,15 +33,9 @@ QUEUES = ("slurm", "pbs")
 MEMORY = "memory"
 """Name of the Dask resource with which a worker declares its memory (MB). Tasks reserve parts of this memory
 while they run on the worker."""
-_POLL_S = 0.2
-"""Time (seconds) between two checks whether a waiting job was stopped. Evidence: none."""
 _PROGRESS_PERIOD_S = 1.0
 """Minimum time (seconds) between two reports of a task's progress. Each report takes a few milliseconds on
 the worker, on the scheduler and on the client. Evidence: none."""
-_WORKERS_PERIOD_S = 2.0
-"""Minimum time (seconds) between two requests for the scheduler's list of workers. The list must be renewed,
-because workers start and end. A request for each task would take longer than the submission of the task.
-Evidence: none."""
 _CLIENT_LEFT = ("closing", "closed")
 _WORKER_ENDS = ("closing", "closed", "failed")
 _ALLOWED_FAILURES = 1
@@ -66,11 +61,6 @@ class Cluster:
         self._progress: dict[str, Callable[[int, int, str], None]] = {}
         self._lock = threading.Lock()
         self._turns = Turns()
-        # Lock for requests to the scheduler. It must not be `_lock`: Dask's thread waits for `_lock` in
-        # `_receive_progress`, and this thread must be free to receive the scheduler's answer.
-        self._asking = threading.Lock()
-        self._largest_memory: float | None = None
-        self._last_asked = -math.inf
         with _lost_connection():
             self._client.subscribe_topic(self._topic, self._receive_progress)
             self._client.run_on_scheduler(_allow_failures, _ALLOWED_FAILURES)
@@ -131,9 +121,9 @@ class Cluster:
         """
         while (largest := self._largest_worker()) is None:
             if environment.cancelled():
-                raise Cancelled(STOPPED, hint="run the job again to continue")
+                raise stopped()
             environment.progress(0, 0, "waiting for a worker")
-            time.sleep(_POLL_S)
+            time.sleep(POLL_S)
         return {MEMORY: min(float(task.memory_mb), largest)} if largest else None
 
     def _largest_worker(self) -> float | None:
@@ -142,23 +132,17 @@ class Cluster:
         Returns:
             The memory; 0 if no worker declares its memory; None if there is no worker.
         """
-        with self._asking:
-            if self._largest_memory is None or time.monotonic() - self._last_asked > _WORKERS_PERIOD_S:
-                if self._client.status in _CLIENT_LEFT:
-                    raise _lost()
-                workers = self.workers().values()
-                memories = (resources.get(MEMORY, 0.0) for resources in workers)
-                self._largest_memory = max(memories, default=None)
-                self._last_asked = time.monotonic()
-            return self._largest_memory
+        if self._client.status in _CLIENT_LEFT:
+            raise _lost()
+        return max((declared.get(MEMORY, 0.0) for declared in self.workers().values()), default=None)
 
     def _wait(self, future: Any, task: Task, environment: TaskEnvironment) -> dict[str, Any]:
         ended = threading.Event()
         future.add_done_callback(lambda _: ended.set())
-        while not ended.wait(_POLL_S):
+        while not ended.wait(POLL_S):
             if environment.cancelled():
                 future.cancel()
-                raise Cancelled(STOPPED, hint="run the job again to continue")
+                raise stopped()
             if self._client.status in _CLIENT_LEFT:
                 raise _lost()
         if future.status == "finished":

@@ -1,9 +1,8 @@
 """The memory limit of a child process: how it is set, and how a lack of memory is recognised.
 
-Where a control group of Linux (version 2) can be created, the kernel limits the memory of the child.
-Elsewhere, the parent compares the resident memory with the limit several times a second, and RLIMIT_DATA
-stops single allocations that are too large to wait for the next comparison. RLIMIT_AS is not used: it counts
-mappings that never need memory. Evidence: docs/decisions/pipeline.md.
+The parent compares the resident memory with the limit several times a second, and RLIMIT_DATA stops single
+allocations that are too large to wait for the next comparison. RLIMIT_AS is not used: it counts mappings that
+never need memory. Evidence: docs/decisions/pipeline.md.
 """
 
 from __future__ import annotations
@@ -77,80 +76,17 @@ def _own_group(root: Path) -> Path | None:
     return None
 
 
-class MemoryGroup:
-    """The control group of one child, in which the kernel limits the child's memory.
-
-    Args:
-        folder: Folder of the new group.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    @classmethod
-    def create(cls, pid: int, root: Path = _CGROUPS) -> MemoryGroup | None:
-        """Create the group of a process. Return None if no group with a memory limit can be created.
-
-        The group is created in the group of this process or beside it. Settings of other groups stay as they
-        are: a parent group must have passed the memory controller on already.
-
-        Args:
-            pid: Number of the process.
-            root: Folder in which the control groups are mounted.
-        """
-        own = _own_group(root)
-        for parent in () if own is None else (own, own.parent):
-            with contextlib.suppress(OSError):
-                if "memory" not in (parent / "cgroup.subtree_control").read_text(encoding="ascii").split():
-                    continue
-                group = cls(parent / f"bodycap-{pid}")
-                group._folder.mkdir()
-                if group._write("memory.max", "max") and group._write("cgroup.procs", str(pid)):
-                    group._write("memory.swap.max", "0")
-                    return group
-                group.remove()
-        return None
-
-    def limit(self, memory_mb: int) -> bool:
-        """Set the limit (MB) for the next task; return False if it cannot be set."""
-        return self._write("memory.max", str(memory_mb * _MB))
-
-    def kills(self) -> int:
-        """Return how often the kernel has ended a process of the group because of its memory."""
-        return _counted(self._folder / "memory.events", "oom_kill")
-
-    def remove(self) -> None:
-        """Remove the group after its process has ended."""
-        with contextlib.suppress(OSError):
-            self._folder.rmdir()
-
-    def _write(self, name: str, value: str) -> bool:
-        try:
-            (self._folder / name).write_text(value, encoding="ascii")
-        except OSError:
-            return False
-        return True
-
-
 def kernel_kills() -> int:
     """Return how often the kernel has ended a process of this machine because of memory; 0 if unknown."""
-    return _counted(Path("/proc/vmstat"), "oom_kill")
-
-
-def _counted(file: Path, name: str) -> int:
     with contextlib.suppress(OSError):
-        for line in file.read_text(encoding="ascii").splitlines():
-            if line.startswith(f"{name} "):
+        for line in Path("/proc/vmstat").read_text(encoding="ascii").splitlines():
+            if line.startswith("oom_kill "):
                 return int(line.split()[1])
     return 0
 
 
-def resident_mb(pid: int) -> float:
-    """Return the resident memory (MB) of a process; 0 if it is unknown."""
-    return _status_mb(str(pid), "VmRSS")
-
-
-def _status_mb(process: str, name: str) -> float:
+def status_mb(process: str | int, name: str) -> float:
+    """Return a size (MB) from the status of a process, such as ``VmRSS`` of a pid; 0 if it is unknown."""
     with contextlib.suppress(OSError):
         for line in Path(f"/proc/{process}/status").read_text(encoding="ascii").splitlines():
             if line.startswith(f"{name}:"):
@@ -169,8 +105,8 @@ def limit_own_memory(memory_mb: int, threads: int) -> None:
     """
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(str(_OOM_SCORE), encoding="ascii")
-    more = max(0.0, memory_mb - _status_mb("self", "VmRSS"))
-    _set_data_limit(_status_mb("self", "VmData") + _DATA_FACTOR * more + _DATA_MB * (1 + threads))
+    more = max(0.0, memory_mb - status_mb("self", "VmRSS"))
+    _set_data_limit(status_mb("self", "VmData") + _DATA_FACTOR * more + _DATA_MB * (1 + threads))
 
 
 def lift_own_limit() -> None:

@@ -13,15 +13,11 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from bodycap_batch.core.errors import Cancelled
-from bodycap_batch.runner.child_pool import NOTHING_TO_LOAD, STOPPED, Children, TaskEnvironment
-from bodycap_batch.runner.child_process import CHILD_COMMAND
+from bodycap_batch.runner.child_pool import NOTHING_TO_LOAD, Children, TaskEnvironment, stopped
+from bodycap_batch.runner.child_process import CHILD_COMMAND, POLL_S
 from bodycap_batch.runner.memory_limit import default_limit_mb
 from bodycap_batch.runner.task import Task
 from bodycap_batch.runner.turns import Turns
-
-_POLL_S = 0.1
-"""Time (seconds) between two checks whether a waiting task was stopped. Evidence: none."""
 
 
 class Slots:
@@ -62,9 +58,9 @@ class Slots:
                 # Only the first task in the order may start: otherwise small tasks could overtake a large
                 # task again and again.
                 while self._waiting[0] != position or not self._fits(need):
-                    self._changed.wait(_POLL_S)
+                    self._changed.wait(POLL_S)
                     if cancelled():
-                        raise Cancelled(STOPPED, hint="run the job again to continue")
+                        raise stopped()
                 self._free = (self._free[0] - need[0], self._free[1] - need[1])
             finally:
                 self._waiting.remove(position)

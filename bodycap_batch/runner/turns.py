@@ -7,12 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from bodycap_batch.core.errors import Cancelled
-from bodycap_batch.runner.child_pool import STOPPED, Executor, TaskEnvironment
+from bodycap_batch.runner.child_pool import Executor, TaskEnvironment, stopped
+from bodycap_batch.runner.child_process import POLL_S
 from bodycap_batch.runner.task import Task
-
-_POLL_S = 0.1
-"""Time (seconds) between two checks whether a waiting job was stopped. Evidence: none."""
 
 
 class Turns:
@@ -34,9 +31,9 @@ class Turns:
         artefact = (environment.store.root, task.key.name)
         with self._changed:
             while artefact in self._under_way:
-                self._changed.wait(_POLL_S)
+                self._changed.wait(POLL_S)
                 if environment.cancelled():
-                    raise Cancelled(STOPPED, hint="run the job again to continue")
+                    raise stopped()
             self._under_way.add(artefact)
         try:
             yield not task.replaces and environment.store.find(task.key) is not None

@@ -277,16 +277,10 @@ class Store:
                 )
 
     def _verified(self, path: Path, key: ArtefactKey) -> Artefact | None:
-        try:
-            manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
-            seal = manifest.pop("seal")
-            sound = seal == json_digest(manifest) and manifest["key"] == _as_json(key.document())
-            sound = sound and all(
-                self._has_digest(path / name, expected) for name, expected in manifest["files"].items()
-            )
-        except (FileNotFoundError, NotADirectoryError, ValueError, KeyError, AttributeError, TypeError):
+        manifest = _sealed_manifest(path)
+        if manifest is None or manifest["key"] != _as_json(key.document()):
             return None  # the artefact is damaged, or another process has just moved it away
-        if not sound:
+        if not all(self._has_digest(path / name, expected) for name, expected in manifest["files"].items()):
             return None
         return Artefact(path=path, digest=manifest["digest"], made=manifest["made"], files=manifest["files"])
 
@@ -366,14 +360,23 @@ def disk_error(error: OSError, path: Path | str) -> StoreError | None:
 
 def _is_sound(path: Path) -> bool:
     """Return True if every file of an artefact has the digest given in the manifest."""
+    manifest = _sealed_manifest(path)
+    try:
+        return manifest is not None and all(
+            file_sha256(path / name) == expected for name, expected in manifest["files"].items()
+        )
+    except FileNotFoundError:
+        return False
+
+
+def _sealed_manifest(path: Path) -> dict[str, Any] | None:
+    """Return the manifest of an artefact; None if it is missing, or if its digest does not hold."""
     try:
         manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
-        files, seal = manifest["files"], manifest.pop("seal")
-        return seal == json_digest(manifest) and all(
-            file_sha256(path / name) == expected for name, expected in files.items()
-        )
-    except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
-        return False
+        seal = manifest.pop("seal")
+        return dict(manifest) if seal == json_digest(manifest) else None
+    except (FileNotFoundError, NotADirectoryError, ValueError, KeyError, AttributeError, TypeError):
+        return None
 
 
 def _as_json(value: Any) -> Any:

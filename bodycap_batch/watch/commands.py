@@ -33,9 +33,7 @@ from bodycap_batch.watch.inbox_entries import (
     take_snapshot,
 )
 from bodycap_batch.watch.job_status import FINAL, JobStatusFile, read_status, utc_text
-from bodycap_batch.watch.process_identity import process_tag
 from bodycap_batch.watch.spool import (
-    CLAIM_PREFIX,
     DONE,
     FAILED,
     RETRY_PREFIX,
@@ -144,8 +142,7 @@ def retry_job(spool: Spool, name: str) -> Path:
                 path=job.path,
                 hint="put the videos into the inbox again",
             )
-        dropped = dropped_name(job)
-        hidden = _hidden_folder(spool)
+        dropped, hidden = dropped_name(job), JobDir(spool.failed / f"{RETRY_PREFIX}{job.name}")
         with _keep_artefacts(job, hidden, spool) as keep_for:
             keep_for(spool.inbox / dropped)
             try:
@@ -194,7 +191,6 @@ def cancel_job(spool: Spool, name: str, wait_s: float = 5.0) -> JobDir | None:
     end = time.monotonic() + wait_s
     with disk_errors(spool.root):
         while (asked := _request_cancel(spool, name)) is None:
-            # A watcher is claiming the job: the job has left the inbox and has no name in `running` yet.
             if time.monotonic() > end:
                 return None
             time.sleep(_POLL_S)
@@ -208,8 +204,7 @@ def cancel_job(spool: Spool, name: str, wait_s: float = 5.0) -> JobDir | None:
 def _request_cancel(spool: Spool, name: str) -> JobDir | None:
     """Cancel a waiting job, or mark a running job so that its watcher cancels it.
 
-    Return None if a watcher is claiming the job. Such a job is also marked. If the claim fails, the job
-    returns to the inbox and the mark is lost.
+    Return None if the job was moved meanwhile, so that it must be looked for again.
     """
     waiting = [entry for entry in entries_in(spool.inbox) if _is_same_name(entry.name, name)]
     job = spool.find(name)
@@ -219,11 +214,7 @@ def _request_cancel(spool: Spool, name: str) -> JobDir | None:
             return job
         if waiting:
             return _cancel_waiting(spool, waiting[0])
-        for job_dir in map(JobDir, spool.running.glob(f"{CLAIM_PREFIX}*")):
-            if name in _dropped_names(job_dir):  # a watcher is claiming this job
-                job_dir.cancel.touch()
-                return None
-    except FileNotFoundError:  # another process has claimed the job, or moved it to its final folder
+    except FileNotFoundError:  # a watcher has claimed the job, or moved it to its final folder
         return None
     raise _unknown_job(
         spool,
@@ -233,18 +224,12 @@ def _request_cancel(spool: Spool, name: str) -> JobDir | None:
     )
 
 
-def _dropped_names(job_dir: JobDir) -> tuple[str, ...]:
-    """Return the names by which users know a job: its name in the inbox, with and without the suffix."""
-    dropped = str(read_status(job_dir).get("dropped", ""))
-    return dropped, Path(dropped).stem
-
-
 def _cancel_waiting(spool: Spool, entry: InboxEntry) -> JobDir:
-    """Move a waiting entry to `failed`.
+    """Move a waiting entry to `failed`. If this process is killed, a watcher moves it back.
 
-    Raise `FileNotFoundError` if another process has claimed the entry.
+    Raise `FileNotFoundError` if a watcher has claimed the entry.
     """
-    job_dir = _hidden_folder(spool)
+    job_dir = JobDir(spool.failed / f"{RETRY_PREFIX}{uuid.uuid4().hex}")
     job_dir.path.mkdir()
     status = JobStatusFile(job_dir)
     status.update(kind="file" if entry.is_file else "folder", dropped=entry.path.name)
@@ -253,7 +238,7 @@ def _cancel_waiting(spool: Spool, entry: InboxEntry) -> JobDir:
     try:
         os.rename(entry.path, input_path(job_dir))
     except FileNotFoundError:
-        shutil.rmtree(job_dir.path)
+        shutil.rmtree(job_dir.path, ignore_errors=True)
         raise
     name = spool.free_name(folder_name_from_text(entry.name))
     error = Cancelled(
@@ -263,11 +248,6 @@ def _cancel_waiting(spool: Spool, entry: InboxEntry) -> JobDir:
         job_dir.path, spool.failed, name, lambda path: status.finish("cancelled", error, path, spool.inbox)
     )
     return JobDir(target)
-
-
-def _hidden_folder(spool: Spool) -> JobDir:
-    """Return a new folder for a job that this process moves. If it is killed, the watcher moves the job."""
-    return JobDir(spool.failed / f"{RETRY_PREFIX}{process_tag()}-{uuid.uuid4().hex}")
 
 
 def _waiting_row(entry: InboxEntry) -> JobRow:
@@ -282,7 +262,7 @@ def _waiting_row(entry: InboxEntry) -> JobRow:
         name=entry.name,
         state="waiting",
         since=utc_text(changed),
-        age_s=_age_s(utc_text(changed)),
+        age_s=_seconds_between(utc_text(changed), utc_text()),
         cause=waits_for,
         path=str(entry.path),
     )
@@ -317,7 +297,7 @@ def job_row(job: JobDir, is_watched: bool = True) -> JobRow:
         stage=f"{status.get('stage', '')} {status.get('camera', '')}".strip() if state != "done" else "",
         progress=status.get("progress") if running else None,
         since=str(since or ""),
-        age_s=_age_s(since),
+        age_s=_seconds_between(since, utc_text()),
         duration_s=_seconds_between(status.get("started_at"), status.get("finished_at")),
         cause=cause,
         hint=str(error.get("hint") or ""),
@@ -333,14 +313,6 @@ def _seconds_between(start: object, end: object) -> float | None:
         first, last = (datetime.fromisoformat(str(moment)) for moment in (start, end))
         return round((last - first).total_seconds(), 1)
     except (ValueError, TypeError):
-        return None
-
-
-def _age_s(moment: object) -> float | None:
-    """Return the time (seconds) since a moment that is given as text; None if the text is not a time."""
-    try:
-        return round(time.time() - datetime.fromisoformat(str(moment)).timestamp(), 1)
-    except ValueError:
         return None
 
 

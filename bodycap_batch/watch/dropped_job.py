@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,7 @@ import yaml
 from bodycap_batch.config.folder import job_file_in
 from bodycap_batch.config.job import load_job, load_job_with_origins, safe_name
 from bodycap_batch.config.limits import Limits
-from bodycap_batch.config.models import SKELETON_PRESETS, CameraConfig, Job
+from bodycap_batch.config.models import Job
 from bodycap_batch.config.origins import LoadedJob
 from bodycap_batch.config.trust import PathPolicy
 from bodycap_batch.config.unfinished_videos import unreadable_videos
@@ -127,7 +126,7 @@ def write_job(job: Job, job_dir: JobDir, dropped: Path) -> None:
         dropped: Current path of the job's input.
     """
     here = dropped.resolve()
-    text = yaml_from_job(with_changed_paths(job, lambda path: _relocated(path, here, Path("input"))))
+    text = yaml_from_job(job.with_paths(lambda path: _relocated(path, here, Path("input"))))
     job_dir.job.write_text(f"{_CHECKSUM_LINE}{_checksum(text)}\n{text}", encoding="utf-8")
 
 
@@ -139,6 +138,12 @@ def read_job(job_dir: JobDir, permissions: JobPermissions) -> Job:
         CaptureError: A video is too large.
         StoreError: The file is damaged.
     """
+    if not job_dir.job.is_file():
+        raise JobError(
+            "the file of the job no longer exists",
+            path=job_dir.job,
+            hint="run `bodycap retry` for this job, which reads the job again",
+        )
     _require_undamaged(job_dir.job)
     policy = path_policy(job_dir.input, permissions.roots, is_file=False)
     job = load_job(job_dir.job, policy=policy, limits=Limits())
@@ -170,50 +175,19 @@ def make_result_paths_relative(job_dir: JobDir, job: Job) -> None:
 
     Args:
         job_dir: The job's folder.
-        job: The job that was run. Places that the run found from the motion are kept.
+        job: The job that was run. It replaces a `job.yaml` of another version, or a damaged one.
 
     Raises:
         StoreError: The disk is full or fails.
     """
     for file in (job_dir.result / "job.yaml", job_dir.result / "partial" / "job.yaml"):
         if file.is_file():
+            try:
+                written = Job.model_validate(yaml.safe_load(file.read_text(encoding="utf-8")))
+            except (yaml.YAMLError, ValueError):
+                written = job
             change = partial(_relative_to_file, job_dir=job_dir.path, file=file)
-            found = _with_found_places(job, file)
-            write_results_file(file.parent, file.name, yaml_from_job(with_changed_paths(found, change)))
-
-
-def _with_found_places(job: Job, results: Path) -> Job:
-    """Return a job with the places that its run found, as the `job.yaml` of its results says."""
-    if not job.capture.unplaced():
-        return job
-    try:
-        document = yaml.safe_load(results.read_text(encoding="utf-8", errors="replace"))
-        cameras = document["capture"]["cameras"]
-        places = {each["name"]: each["mount"] for each in cameras if each.get("mount_source") == "motion"}
-    except (yaml.YAMLError, AttributeError, KeyError, TypeError):  # left by another version, or damaged
-        return job
-    is_complete = all(camera.name in places for camera in job.capture.unplaced())
-    return job.with_places(places) if is_complete else job
-
-
-def with_changed_paths(job: Job, change: Callable[[Path], Path]) -> Job:
-    """Return the job with every path replaced by `change(path)`, and without an output folder."""
-
-    def camera(config: CameraConfig) -> CameraConfig:
-        return config.model_copy(
-            update={
-                "video": tuple(map(change, config.video)),
-                "timestamps": tuple(map(change, config.timestamps)),
-                "samples": None if config.samples is None else change(config.samples),
-                "mask": None if config.mask is None else change(config.mask),
-            }
-        )
-
-    capture = job.capture.model_copy(update={"cameras": tuple(map(camera, job.capture.cameras))})
-    skeleton = job.skeleton
-    if skeleton is not None and skeleton not in SKELETON_PRESETS:
-        skeleton = str(change(Path(skeleton)))
-    return job.model_copy(update={"capture": capture, "skeleton": skeleton, "out": None})
+            write_results_file(file.parent, file.name, yaml_from_job(written.with_paths(change)))
 
 
 def yaml_from_job(job: Job) -> str:

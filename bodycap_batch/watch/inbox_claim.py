@@ -5,40 +5,28 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-import uuid
 from collections.abc import Callable
 from pathlib import Path
 
 from bodycap_batch.config.folder import JOB_FILES
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import BodycapError, StoreError
-from bodycap_batch.store.artefacts import store_error
+from bodycap_batch.store.artefacts import disk_errors, store_error
 from bodycap_batch.watch.dropped_job import JobPermissions, read_dropped_job, unread_job_files, write_job
 from bodycap_batch.watch.inbox_entries import YAML_SUFFIXES, EntrySnapshot, InboxEntry, take_snapshot
-from bodycap_batch.watch.job_status import JobStatusFile, read_status
-from bodycap_batch.watch.process_identity import is_process_running
-from bodycap_batch.watch.spool import (
-    CLAIM_PREFIX,
-    RETRY_PREFIX,
-    JobDir,
-    Spool,
-    folder_name_from_text,
-    move_to_free_name,
-)
-
-_UNKNOWN_NAME = "job"
-"""Name of a job whose own name is unknown."""
+from bodycap_batch.watch.job_status import JobStatusFile, append_log, read_status
+from bodycap_batch.watch.spool import RETRY_PREFIX, JobDir, Spool, folder_name_from_text, move_to_free_name
 
 
 def claim_entry(
     spool: Spool, entry: InboxEntry, snapshot: EntrySnapshot, permissions: JobPermissions
-) -> tuple[JobDir, BodycapError | None] | None:
+) -> JobDir | None:
     """Claim a complete entry of the inbox.
 
-    First the job is read in the inbox and written to a hidden folder. Then the entry is renamed into that
-    folder. This rename is the claim: if the watcher is killed before it, the entry is still in the inbox; if
-    the watcher is killed after it, the next watcher runs the job. Finally the hidden folder gets its visible
-    name in `running`.
+    First the job is read in the inbox, and written to a new folder in `running`. Then the entry is renamed
+    into that folder. This rename is the claim: if the watcher is killed before it, the entry is still in the
+    inbox; if the watcher is killed after it, the next watcher runs the job. The status of a job that cannot
+    be read says from the start that the job has failed.
 
     Args:
         spool: The folders of the watcher.
@@ -47,51 +35,42 @@ def claim_entry(
         permissions: Which folders the job may read, and the maximum size of the job.
 
     Returns:
-        The job's folder, and the error that was found when the job was read (or None). The whole result is
-        None if the entry is gone, or if it is still changing.
+        The job's folder; None if the entry is gone, or if it is still changing.
 
     Raises:
         StoreError: The entry cannot be moved.
     """
-    job_dir = JobDir(spool.running / f"{CLAIM_PREFIX}{uuid.uuid4().hex}")
-    try:
+    job, warnings, error = _read_job_or_error(entry, snapshot, permissions)
+    job_dir = JobDir(spool.running / spool.free_name(folder_name_from_text(entry.name)))
+    with disk_errors(entry.path):
         spool.running.mkdir(exist_ok=True)  # a user may have removed the folder
         job_dir.path.mkdir()
-        error = _write_job_files(job_dir, entry, snapshot, permissions)
-        if not _move_entry(job_dir, entry, snapshot, permissions):
-            shutil.rmtree(job_dir.path)
-            return None
-        return move_to_running(spool, job_dir), error
+    try:
+        if job is not None:
+            write_job(job, job_dir, job_dir.input if entry.is_file else entry.path)
+        status = JobStatusFile(job_dir)
+        status.update(kind="file" if entry.is_file else "folder", dropped=entry.path.name)
+        for note in (*_notes_about_job_files(entry), *warnings):
+            status.add_note(note)
+        if error is not None:
+            append_log(job_dir, f"failed: {error}")
+            status.finish("failed", error, spool.failed / job_dir.name, spool.inbox)
+        if _move_entry(job_dir, entry, snapshot, permissions):
+            return job_dir
+        shutil.rmtree(job_dir.path)
     except (OSError, StoreError) as failed:
-        with contextlib.suppress(OSError, StoreError):  # else the watcher completes the claim later
+        with contextlib.suppress(OSError, StoreError):  # else the next watcher runs the job
             return_to_inbox(spool, job_dir)
         raise store_error(failed, entry.path) if isinstance(failed, OSError) else failed from failed
+    return None
 
 
-def move_to_running(spool: Spool, job_dir: JobDir) -> JobDir:
-    """Give a claimed hidden folder its visible name in `running`, and return the renamed folder."""
-    previous = read_status(job_dir, strict=True)
-    status = JobStatusFile(job_dir, previous)
-    dropped = dropped_name(job_dir)
-    is_file = input_path(job_dir) != job_dir.input
-    wanted = folder_name_from_text(Path(dropped).stem if is_file else dropped)
-
-    def rename(target: Path) -> None:
-        status.update(name=target.name)
-
-    return JobDir(move_to_free_name(job_dir.path, spool.running, spool.free_name(wanted), rename))
-
-
-def finish_interrupted_claims(spool: Spool) -> None:
-    """Complete the claims of a watcher that was killed, or whose disk failed.
-
-    The hidden folder of a claim gets its visible name. If no entry was moved into it, it is removed.
-    """
-    for path in sorted(spool.running.glob(f"{CLAIM_PREFIX}*")):
-        if path_exists(input_path(JobDir(path))):
-            move_to_running(spool, JobDir(path))
-        else:
-            shutil.rmtree(path, ignore_errors=True)
+def is_unfinished_claim(job_dir: JobDir) -> bool:
+    """Return True for a folder in `running` whose watcher was killed before the entry was moved into it."""
+    status = read_status(job_dir, strict=True)
+    if status.get("started_at") or path_exists(input_path(job_dir)):
+        return False
+    return bool(status) or {path.name for path in job_dir.path.iterdir()} <= {job_dir.job.name}
 
 
 def path_exists(path: Path) -> bool:
@@ -121,7 +100,7 @@ def dropped_name(job_dir: JobDir) -> str:
     path = input_path(job_dir)
     if path != job_dir.input:
         return path.name
-    return _UNKNOWN_NAME if job_dir.name.startswith(".") else job_dir.name
+    return job_dir.name.removeprefix(RETRY_PREFIX)
 
 
 def _only_job_file(folder: Path) -> Path | None:
@@ -145,38 +124,33 @@ def return_to_inbox(
         before_move: Function that is called with the target path just before the move.
 
     Returns:
-        The new path in the inbox; None if the job's folder holds no input.
+        The new path in the inbox; None if the job's folder holds no input, or if another process moved it.
     """
     dropped, target = input_path(job_dir), None
     if path_exists(dropped):
         name = dropped_name(job_dir)
         suffix = dropped.suffix if dropped != job_dir.input else ""
-        target = move_to_free_name(dropped, spool.inbox, name, before_move, suffix=suffix)
+        with contextlib.suppress(FileNotFoundError):  # another process moves the job, too
+            target = move_to_free_name(dropped, spool.inbox, name, before_move, suffix=suffix)
     shutil.rmtree(job_dir.path, ignore_errors=True)
     return target
 
 
 def finish_interrupted_retries(spool: Spool) -> None:
-    """Find jobs whose `retry` or `cancel` command was killed during the move, and move them to the inbox."""
+    """Move the jobs to the inbox whose `retry` command was killed during the move.
+
+    It does no harm if the command is still at work: both do the same, and the second one finds nothing to
+    move.
+    """
     for path in sorted(spool.failed.glob(f"{RETRY_PREFIX}*")):
-        if not is_process_running(path.name.removeprefix(RETRY_PREFIX)):
-            return_to_inbox(spool, JobDir(path))
+        return_to_inbox(spool, JobDir(path))
 
 
-def _write_job_files(
-    job_dir: JobDir, entry: InboxEntry, snapshot: EntrySnapshot, permissions: JobPermissions
-) -> BodycapError | None:
-    """Read the job, and write all its files except the input. Return the error of the job, or None."""
-    job, warnings, error = _read_job_or_error(entry, snapshot, permissions)
-    if job is not None:
-        write_job(job, job_dir, entry.path.parent / entry.path.name if not entry.is_file else job_dir.input)
-    status = JobStatusFile(job_dir)
-    for name in [] if entry.is_file else unread_job_files(entry.path):
-        status.add_note(f"{name} was not used, because a job file in a folder must have the name job.yaml")
-    for warning in warnings:
-        status.add_note(warning)
-    status.update(kind="file" if entry.is_file else "folder", dropped=entry.path.name)
-    return error
+def _notes_about_job_files(entry: InboxEntry) -> list[str]:
+    names = [] if entry.is_file else unread_job_files(entry.path)
+    return [
+        f"{name} was not used, because a job file in a folder must have the name job.yaml" for name in names
+    ]
 
 
 def _move_entry(

@@ -17,7 +17,6 @@ from bodycap_batch.core.errors import (
     BodycapError,
     Cancelled,
     DiskAway,
-    JobError,
     StoreError,
     error_from_dict,
     one_line,
@@ -105,26 +104,21 @@ class JobWorker:
         self._stage_turns = Turns()
         self._store = Store(options.store or spool.root / ".store")
 
-    def process(self, job_dir: JobDir, read_error: BodycapError | None = None) -> JobOutcome:
-        """Run a claimed job until it is in its final folder, or until it is left for a later attempt.
-
-        Args:
-            job_dir: The job's folder.
-            read_error: The error that was found when the job was read, or None.
-        """
+    def process(self, job_dir: JobDir) -> JobOutcome:
+        """Run a claimed job until it is in its final folder, or until it is left for a later attempt."""
         try:
-            return self._process(job_dir, read_error)
+            return self._process(job_dir)
         except (BodycapError, OSError) as error:
             return self._give_up(job_dir) if self._is_deleted(job_dir) else _stuck(job_dir, error)
 
-    def _process(self, job_dir: JobDir, read_error: BodycapError | None) -> JobOutcome:
+    def _process(self, job_dir: JobDir) -> JobOutcome:
         previous = read_status(job_dir, strict=True)
-        if previous.get("state") in FINAL:  # an earlier watcher ended before it moved the job
+        if (
+            previous.get("state") in FINAL
+        ):  # it could not be read, or an earlier watcher ended before the move
             return self._file(job_dir, previous["state"], _error_from_status(previous), None)
         status = JobStatusFile(job_dir, previous)
         try:
-            if read_error is not None:
-                raise read_error
             self._run(job_dir, status)
         except Cancelled as error:
             return self._handle_cancelled(job_dir, status, error)
@@ -151,12 +145,6 @@ class JobWorker:
             host=socket.gethostname(),
             store=str(self._store.root),
         )
-        if not job_dir.job.is_file():  # an earlier watcher ended before it wrote the job
-            raise JobError(
-                "the job was not read, because the watcher ended too early",
-                path=job_dir.input,
-                hint="run `bodycap retry` for this job",
-            )
         job = read_job(job_dir, self._options.permissions)
         if job.require is None:
             job = job.model_copy(update={"require": self._options.require})

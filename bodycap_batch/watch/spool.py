@@ -16,10 +16,10 @@ from bodycap_batch.store.artefacts import disk_errors
 
 INBOX, RUNNING, DONE, FAILED = "inbox", "running", "done", "failed"
 _JOB_FOLDERS = (RUNNING, DONE, FAILED)
-CLAIM_PREFIX, RETRY_PREFIX = ".claim-", ".retry-"
-"""Name prefixes of the hidden folders of jobs that a watcher is claiming (``.claim-``) or that a command is
-moving (``.retry-``). If the process that moves such a job is killed, the watcher completes the move."""
-_MAX_NAME_BYTES = 200
+RETRY_PREFIX = ".retry-"
+"""Name prefix of the hidden folder of a job that `bodycap retry` or `cancel` moves. If the command is killed,
+the watcher moves the job to the inbox."""
+MAX_NAME_BYTES = 200
 """Maximum length (bytes) of a job's name. File systems usually permit 255 bytes. The remaining bytes
 are for a number and the suffixes of temporary files."""
 _NAME_TAKEN_ERRORS = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR, errno.EISDIR)
@@ -221,9 +221,9 @@ def visible_entries(folder: Path) -> list[Path]:
 def folder_name_from_text(text: str) -> str:
     """Return a valid name for a job's folder that is close to a text.
 
-    The name has at most `_MAX_NAME_BYTES` bytes, no control characters, and no leading dash or dot.
+    The name has at most `MAX_NAME_BYTES` bytes, no control characters, and no leading dash or dot.
     """
     clean = "".join("_" if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") else c for c in text).strip()
     clean = unicodedata.normalize("NFC", clean)
-    short = clean.encode()[:_MAX_NAME_BYTES].decode(errors="ignore").strip()
+    short = clean.encode()[:MAX_NAME_BYTES].decode(errors="ignore").strip()
     return "_" + short[1:] if short[:1] in ("-", ".", "") else short

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import collections
+import shutil
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-from bodycap_batch.core.errors import BodycapError, StoreError, one_line, worst_exit_code
+from bodycap_batch.core.errors import StoreError, one_line, worst_exit_code
 from bodycap_batch.store.artefacts import store_error
 from bodycap_batch.watch.inbox_claim import (
     claim_entry,
-    finish_interrupted_claims,
     finish_interrupted_retries,
+    input_path,
+    is_unfinished_claim,
     path_exists,
 )
 from bodycap_batch.watch.inbox_entries import (
@@ -25,15 +27,10 @@ from bodycap_batch.watch.inbox_entries import (
     entries_in,
     ignored_paths_in,
 )
+from bodycap_batch.watch.job_status import FINAL, read_status
 from bodycap_batch.watch.job_worker import JobOutcome, JobWorker, WatchOptions
 from bodycap_batch.watch.spool import JobDir, Spool, visible_entries
 from bodycap_batch.watch.watcher_status import WatcherStatusFile
-
-_FIRST_PAUSE_S = 1.0
-"""Time (seconds) between the first failure and the second attempt. Each further failure doubles this
-time. Evidence: none."""
-_MAX_PAUSE_S = 60.0
-"""Maximum time (seconds) between two attempts. Evidence: none."""
 
 
 class AccessFailures:
@@ -58,7 +55,6 @@ class AccessFailures:
         self._write_line = write_line
         self._clock = clock
         self._since = 0.0
-        self._pause_s = 0.0
         self.current: StoreError | None = None
 
     @property
@@ -72,8 +68,8 @@ class AccessFailures:
         """Time (seconds) since the first of the current failures; 0 if there is no failure."""
         return 0.0 if self.current is None else self._clock() - self._since
 
-    def record(self, error: OSError | StoreError) -> float:
-        """Record a failure, and return the time (seconds) to wait before the next attempt."""
+    def record(self, error: OSError | StoreError) -> None:
+        """Record a failure."""
         previous_text = self.text
         failure = store_error(error, self._spool.root) if isinstance(error, OSError) else error
         if self.current is None:
@@ -83,8 +79,6 @@ class AccessFailures:
             self._write_line(
                 f"{self.text}; the watcher tries again until the folder is accessible ({failure.hint})"
             )
-        self._pause_s = min(_MAX_PAUSE_S, 2.0 * self._pause_s or _FIRST_PAUSE_S)
-        return self._pause_s
 
     def clear(self) -> None:
         """Record that the folders are accessible again."""
@@ -92,18 +86,16 @@ class AccessFailures:
             self._write_line(
                 f"{self._spool.root} is accessible again after {self.duration_s:.0f} s; the watcher continues"
             )
-        self.current, self._pause_s = None, 0.0
+        self.current = None
 
 
 MessageSink = Callable[[str], None]
 _POLL_S = 1.0
-"""Time (seconds) between two scans of the inbox. Derivation: an entry must not change for `unchanged_s`, 10
+"""Time (seconds) between two scans of the folders. Derivation: an entry must not change for `unchanged_s`, 10
 seconds, before its job starts, so a job starts at most a tenth later than it could."""
 _SCAN_PAUSE_FACTOR = 20.0
 """Minimum ratio of the time between two scans to the duration of a scan. With a ratio of 20, scans take at
 most 5 % of the time. A scan of a thousand large folders on a slow disk takes several seconds."""
-_CONTINUE_PERIOD_S = 2.0
-"""Minimum time (seconds) between two searches for stopped jobs. Evidence: none."""
 
 
 class Watcher:
@@ -137,10 +129,8 @@ class Watcher:
         self._running: dict[Future[JobOutcome], JobDir] = {}
         self._stuck_until: dict[str, float] = {}
         self._unmovable: dict[str, tuple[str, float]] = {}
-        self._reported: dict[Path, str] = {}
         self._complete: collections.deque[tuple[InboxEntry, EntrySnapshot]] = collections.deque()
-        self._reported_once: set[str] = set()
-        self._last_reports: dict[str, str] = {}
+        self._reports: dict[str, str] = {}
         self._has_waiting = False
         self._has_stopped_jobs = False
         self._next_scan_at = 0.0
@@ -158,8 +148,7 @@ class Watcher:
     def run(self) -> int:
         """Watch until `stop` is called. With the option `once`, also end when nothing is left to do.
 
-        The watcher waits for a missing disk, with growing pauses between its attempts. With `once`, it waits
-        for at most `retry_s` seconds.
+        The watcher waits for a missing disk. With `once`, it waits for at most `retry_s` seconds.
 
         Returns:
             The worst exit code of the jobs that ended and of the watcher's own disk failures.
@@ -169,11 +158,11 @@ class Watcher:
                 self._status_file.write("")
                 while not self._stop.is_set():
                     self._collect()
-                    pause_s = self._step(pool)
+                    is_finished = self._step(pool)
                     self._status_file.write(self.access_failures.text)
-                    if pause_s is None:
+                    if is_finished:
                         break
-                    self._woken.wait(pause_s)
+                    self._woken.wait(_POLL_S)
                     self._woken.clear()  # no stop is lost: `stop` sets `_stop` before `_woken`
             finally:
                 self._stop.set()
@@ -184,36 +173,25 @@ class Watcher:
     def _note_exit_code(self, code: int) -> None:
         self._worst_exit_code = worst_exit_code((self._worst_exit_code, code))
 
-    def _step(self, pool: ThreadPoolExecutor) -> float | None:
-        """Start the jobs that can start. Return the time (seconds) until the next scan, or None to end."""
+    def _step(self, pool: ThreadPoolExecutor) -> bool:
+        """Start the jobs that can start. Return True if the watcher must end."""
         try:
             is_finished = not self._fill(pool) and self._options.once
             if is_finished:
                 self._report_left_entries()
         except (OSError, StoreError) as error:
-            pause_s = self.access_failures.record(error)
+            self.access_failures.record(error)
             if not self._options.once or self.access_failures.duration_s < self._options.retry_s:
-                return pause_s
+                return False
             self._note_exit_code(StoreError.exit_code)
-            return None
+            return True
         self.access_failures.clear()
-        return None if is_finished else _POLL_S
+        return is_finished
 
-    def _finish_moves(self) -> None:
-        """Complete the moves of commands and watchers that were killed. Report a failure once."""
-        for finish, folder in (
-            (finish_interrupted_retries, self.spool.failed),
-            (finish_interrupted_claims, self.spool.running),
-        ):
-            try:
-                finish(self.spool)
-            except (OSError, StoreError) as error:
-                self._note_exit_code(StoreError.exit_code)
-                self._report_once(f"an interrupted move in {folder} cannot be completed: {one_line(error)}")
-
-    def _report_once(self, line: str) -> None:
-        if line not in self._reported_once:
-            self._reported_once.add(line)
+    def _report(self, subject: str, line: str) -> None:
+        """Report a line to the operator, unless it is the last line that was reported about its subject."""
+        if self._reports.get(subject) != line:
+            self._reports[subject] = line
             self._write_line(line)
 
     def _report_left_entries(self) -> None:
@@ -236,27 +214,23 @@ class Watcher:
             self._report_end(outcome)
 
     def _report_end(self, outcome: JobOutcome) -> None:
-        """Report how a job ended.
-
-        If the job is postponed again for the same reason, report the reason once.
-        """
+        """Report how a job ended, or why it was postponed."""
         where = f" -> {outcome.path}" if outcome.path is not None else ""
         line = f"{outcome.name}: {outcome.state}{where}" + (f": {outcome.message}" if outcome.message else "")
-        if line != self._last_reports.pop(outcome.name, ""):
-            self._write_line(line)
-        if outcome.state in ("stopped", "stuck"):
-            self._last_reports[outcome.name] = line
+        self._report(outcome.name, line)
+        if outcome.state not in ("stopped", "stuck"):
+            del self._reports[outcome.name]
 
     def _fill(self, pool: ThreadPoolExecutor) -> bool:
         """Start jobs up to the maximum number. Return False if no job runs and no job is expected."""
         free = self._options.jobs - len(self._running)
         for job_dir in self._stopped_jobs(free):
-            self._start(pool, job_dir, None)
+            self._start(pool, job_dir)
             free -= 1
         self._scan_inbox()
         while free > 0 and self._complete:
             if (claimed := self._try_claim(*self._complete.popleft())) is not None:
-                self._start(pool, *claimed)
+                self._start(pool, claimed)
                 free -= 1
         return bool(self._running or self._complete or self._has_waiting or self._has_stopped_jobs)
 
@@ -275,38 +249,35 @@ class Watcher:
         self._complete = collections.deque(self._tracker.complete_entries(entries))
         names = {str(entry.path) for entry in entries}
         self._unmovable = {name: value for name, value in self._unmovable.items() if name in names}
+        gone = [name for name in self._reports if name not in names and Path(name).parent == self.spool.inbox]
+        for name in gone:
+            del self._reports[name]
         self._has_waiting = bool(names - self._unmovable.keys() - set(map(str, self._tracker.incomplete)))
         self._report_incomplete()
         now = time.monotonic()
         self._next_scan_at = now + _SCAN_PAUSE_FACTOR * (now - started)
 
     def _report_incomplete(self) -> None:
-        """Report each entry that cannot be read or is not complete, once for each reason."""
-        tracker, found = self._tracker, dict(self._tracker.incomplete)
-        for path, reason in found.items():
-            if self._reported.get(path) == reason:
-                continue
-            if path in tracker.unreadable:
+        """Report each entry that cannot be read or is not complete."""
+        for path, reason in self._tracker.incomplete.items():
+            if path in self._tracker.unreadable:
                 self._note_exit_code(StoreError.exit_code)
-                self._write_line(f"{path.name}: cannot be read: {reason}")
+                self._report(str(path), f"{path.name}: cannot be read: {reason}")
             elif not self._options.once:  # otherwise the reasons are reported at the end
-                self._write_line(f"{path.name} waits: {reason}")
-        self._reported = found
+                self._report(str(path), f"{path.name} waits: {reason}")
 
-    def _start(self, pool: ThreadPoolExecutor, job_dir: JobDir, read_error: BodycapError | None) -> None:
-        if read_error is None and job_dir.name not in self._last_reports:
+    def _start(self, pool: ThreadPoolExecutor, job_dir: JobDir) -> None:
+        if job_dir.name not in self._reports and read_status(job_dir).get("state") not in FINAL:
             self._write_line(f"{job_dir.name}: started")
-        future = pool.submit(self._worker.process, job_dir, read_error)
+        future = pool.submit(self._worker.process, job_dir)
         self._running[future] = job_dir
         future.add_done_callback(lambda _: self._woken.set())
 
-    def _try_claim(
-        self, entry: InboxEntry, snapshot: EntrySnapshot
-    ) -> tuple[JobDir, BodycapError | None] | None:
+    def _try_claim(self, entry: InboxEntry, snapshot: EntrySnapshot) -> JobDir | None:
         """Claim an entry. Return None if it cannot be claimed.
 
-        If the entry cannot be moved, report this once, and try again after `retry_s` seconds or when the
-        entry changes.
+        If the entry cannot be moved, report this, and try again after `retry_s` seconds or when the entry
+        changes.
         """
         digest, until = self._unmovable.get(str(entry.path), ("", 0.0))
         if digest == snapshot.digest and time.monotonic() < until:
@@ -316,8 +287,7 @@ class Watcher:
         except StoreError as error:
             self._unmovable[str(entry.path)] = (snapshot.digest, time.monotonic() + self._options.retry_s)
             self._note_exit_code(error.exit_code)
-            if digest != snapshot.digest:
-                self._write_line(f"{entry.name}: cannot be moved out of the inbox: {error.one_line}")
+            self._report(str(entry.path), f"{entry.name}: cannot be moved out of the inbox: {error.one_line}")
             return None
 
     def _stopped_jobs(self, max_jobs: int) -> list[JobDir]:
@@ -328,17 +298,31 @@ class Watcher:
         now = time.monotonic()
         if max_jobs <= 0 or now < self._next_continue_at:
             return []
-        self._finish_moves()
-        own_jobs = {job_dir.path for job_dir in self._running.values()}
-        found = []
+        self._finish_retries()
+        own_jobs, found = {job_dir.path for job_dir in self._running.values()}, []
         paths = visible_entries(self.spool.running)
-        self._next_continue_at = now + _CONTINUE_PERIOD_S
-        for path in paths:
-            if not path.is_dir() or path in own_jobs or self._stuck_until.get(path.name, now) > now:
+        self._next_continue_at = now + _POLL_S
+        for job_dir in map(JobDir, paths):
+            is_free = job_dir.path.is_dir() and job_dir.path not in own_jobs
+            if not is_free or self._stuck_until.get(job_dir.name, now) > now:
                 continue
-            if path_exists(JobDir(path).input):
-                found.append(JobDir(path))
+            if path_exists(input_path(job_dir)):
+                found.append(job_dir)
+            elif is_unfinished_claim(job_dir):
+                shutil.rmtree(job_dir.path, ignore_errors=True)
             else:
-                self._report_once(f"{path.name} stays in {self.spool.running}: the videos no longer exist")
+                line = f"{job_dir.name} stays in {self.spool.running}: the videos no longer exist"
+                self._report(str(job_dir.path), line)
         self._has_stopped_jobs = bool(found)  # more stopped jobs may be left
         return found[:max_jobs]
+
+    def _finish_retries(self) -> None:
+        """Complete the moves of `retry` commands that were killed."""
+        try:
+            finish_interrupted_retries(self.spool)
+        except (OSError, StoreError) as error:
+            self._note_exit_code(StoreError.exit_code)
+            folder = self.spool.failed
+            self._report(
+                str(folder), f"an interrupted move in {folder} cannot be completed: {one_line(error)}"
+            )

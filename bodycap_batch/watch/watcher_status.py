@@ -19,35 +19,29 @@ from bodycap_batch.store.artefacts import disk_errors
 from bodycap_batch.store.checked_json import checked_json, parse_checked_json
 from bodycap_batch.store.digests import write_atomically
 from bodycap_batch.watch.job_status import utc_text
-from bodycap_batch.watch.process_identity import is_from_this_machine, is_process_running, process_tag
 from bodycap_batch.watch.spool import Spool
 
 _LOCK, _STATUS = ".watcher.lock", ".watcher.json"
 """Names of the lock file and of the status file in the parent folder of `running`."""
-_WRITE_PERIOD_S = 5.0
-"""Time (seconds) between two writes of the status file while nothing changes. Evidence: none."""
-_MAX_SILENCE_S = 86_400.0
-"""Maximum age (seconds) of the status file of a watcher on another machine: one day. A watcher with an older
-file is not listed, because this machine cannot check whether that watcher still runs."""
+_LOCK_ATTEMPTS, _LOCK_PAUSE_S = 5, 0.1
+"""Number of attempts to lock the folder, and time (seconds) between two of them. `active_watcher` holds the
+lock for less than a millisecond to test it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WatcherStatus:
-    """The status of a watcher, as other processes can read it.
+    """The status of a running watcher, as other processes can read it.
 
     Attributes:
         host: Name of the watcher's machine.
         pid: Process number of the watcher on its machine.
         since: Start time of the watcher, UTC.
-        seen: Time of the last update by the watcher's own clock, UTC. It is "" for a watcher of this machine,
-            because this machine can check whether the watcher runs.
         trouble: Why the watcher cannot access its folders; "" if it can access them.
     """
 
     host: str
     pid: int
     since: str
-    seen: str = ""
     trouble: str = ""
 
     def to_dict(self) -> dict[str, Any]:
@@ -55,9 +49,8 @@ class WatcherStatus:
         return asdict(self)
 
     def __str__(self) -> str:
-        seen = f", last seen {self.seen}" if self.seen else ""
         trouble = f", cannot continue: {self.trouble}" if self.trouble else ""
-        return f"watched by {self.host} (process {self.pid}) since {self.since}{seen}{trouble}"
+        return f"watched by {self.host} (process {self.pid}) since {self.since}{trouble}"
 
 
 class WatcherStatusFile:
@@ -74,12 +67,9 @@ class WatcherStatusFile:
         self._path = spool.root / _STATUS
         self._since = utc_text()
         self._written: str | None = None
-        self._write_again_at = 0.0
         with disk_errors(spool.root):
             self._lock = (spool.root / _LOCK).open("ab")
-            try:
-                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+            if not any(self._try_lock(attempt) for attempt in range(_LOCK_ATTEMPTS)):
                 self._lock.close()
                 found = active_watcher(spool)
                 raise StoreError(
@@ -87,27 +77,27 @@ class WatcherStatusFile:
                     path=spool.root,
                     hint="stop that watcher, or watch another folder; one watcher can run several jobs "
                     "(`--jobs`), and `bodycap batch` can use several machines",
-                ) from None
+                )
+
+    def _try_lock(self, attempt: int) -> bool:
+        time.sleep(_LOCK_PAUSE_S if attempt else 0.0)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        return True
 
     def write(self, trouble: str) -> None:
         """Record that the watcher runs, and why it cannot access its folders ("" if it can access them).
 
         Write errors are ignored. Their cause may be the disk failure that the file should report.
         """
-        now = time.monotonic()
-        if self._written == trouble and now < self._write_again_at:
+        if self._written == trouble:
             return
-        document = {
-            "host": socket.gethostname(),
-            "pid": os.getpid(),
-            "process": process_tag(),
-            "since": self._since,
-            "seen": utc_text(),
-            "trouble": trouble,
-        }
+        status = WatcherStatus(host=socket.gethostname(), pid=os.getpid(), since=self._since, trouble=trouble)
         with contextlib.suppress(OSError):
-            write_atomically(self._path, checked_json(document).encode())
-            self._written, self._write_again_at = trouble, now + _WRITE_PERIOD_S
+            write_atomically(self._path, checked_json(status.to_dict()).encode())
+            self._written = trouble
 
     def remove(self) -> None:
         """Remove the status file, and release the lock."""
@@ -117,24 +107,13 @@ class WatcherStatusFile:
 
 
 def active_watcher(spool: Spool) -> WatcherStatus | None:
-    """Return the running watcher of a spool; None if there is none, or if its file is damaged.
-
-    A watcher of another machine is treated as running if its file was updated within the last
-    `_MAX_SILENCE_S` seconds.
-    """
-    path = spool.root / _STATUS
+    """Return the running watcher of a spool; None if there is none, or if its file is damaged."""
     try:
-        found = parse_checked_json(path.read_bytes())
-        process = str(found["process"])
-        here = is_from_this_machine(process)
-        age_s = time.time() - path.stat().st_mtime
-        status = WatcherStatus(
-            host=str(found["host"]),
-            pid=int(found["pid"]),
-            since=str(found["since"]),
-            seen="" if here else str(found["seen"]),
-            trouble=str(found["trouble"]),
-        )
-    except (OSError, ValueError, KeyError, TypeError):
+        with (spool.root / _LOCK).open("rb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:  # a watcher holds the lock
+        with contextlib.suppress(OSError, ValueError, TypeError):
+            return WatcherStatus(**parse_checked_json((spool.root / _STATUS).read_bytes()))
+    except OSError:  # no watcher has run here
         return None
-    return status if (is_process_running(process) if here else age_s <= _MAX_SILENCE_S) else None
+    return None

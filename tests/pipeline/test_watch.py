@@ -32,8 +32,6 @@ from bodycap_batch.watch import (
 )
 from bodycap_batch.watch.commands import job_row
 from bodycap_batch.watch.inbox_entries import EntrySnapshot, InboxEntry, take_snapshot
-from bodycap_batch.watch.job_status import JobStatusFile
-from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir
 from tests.pipeline.spools import SpoolFixture, remove_in_use, wait_for
 from tests.pipeline.test_watch_disk import running
 from tests.processes import gone
@@ -358,23 +356,29 @@ def test_an_entry_is_returned_if_it_cannot_be_read_any_more(
     assert leftovers(bench) == []
 
 
-def test_an_abandoned_claim_is_removed_only_if_it_is_empty(bench: SpoolFixture) -> None:
-    for name, dropped in (("empty", False), ("full", True)):
-        job_dir = JobDir(bench.spool.running / f"{CLAIM_PREFIX}{name}")
-        job_dir.path.mkdir()
-        if dropped:
-            bench.drop("walk").rename(job_dir.input)
-            JobStatusFile(job_dir).update(dropped="walk")
-    assert bench.run_once() == JobError.exit_code
-    assert (
-        bench.status("walk")["error"]["message"]
-        == "the job was not read, because the watcher ended too early"
-    )
-    assert (bench.job("walk").input / "torso.mp4").is_file()
+def test_a_claim_that_was_killed_loses_no_job(bench: SpoolFixture) -> None:
+    entry = InboxEntry(bench.drop("walk"))
+    claimed = inbox_claim.claim_entry(bench.spool, entry, take_snapshot(entry, 100), JobPermissions())
+    assert claimed is not None
+    claimed.input.rename(entry.path)  # as before the move
+    (bench.spool.running / "at the start").mkdir()
+    assert bench.run_once() == 0
+    assert [job.path for job in bench.spool.jobs()] == [bench.spool.done / "walk"]
     assert leftovers(bench) == []
 
 
-def test_a_claim_that_cannot_be_completed_stops_no_watcher(
+def test_a_job_whose_file_was_removed_is_read_again_by_a_retry(bench: SpoolFixture) -> None:
+    entry = InboxEntry(bench.drop("walk"))
+    claimed = inbox_claim.claim_entry(bench.spool, entry, take_snapshot(entry, 100), JobPermissions())
+    assert claimed is not None
+    claimed.job.unlink()
+    assert bench.run_once() == JobError.exit_code
+    assert bench.status("walk")["error"]["message"] == "the file of the job no longer exists"
+    retry_job(bench.spool, "walk")
+    assert bench.run_once() == 0
+
+
+def test_a_move_that_cannot_be_completed_stops_no_watcher(
     bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.drop("walk")
@@ -382,10 +386,10 @@ def test_a_claim_that_cannot_be_completed_stops_no_watcher(
     def fail(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("bodycap_batch.watch.watcher.finish_interrupted_claims", fail)
+    monkeypatch.setattr("bodycap_batch.watch.watcher.finish_interrupted_retries", fail)
     assert bench.run_once() == StoreError.exit_code
     assert bench.status("walk")["state"] == "done"
-    start = f"an interrupted move in {bench.spool.running} cannot be completed: "
+    start = f"an interrupted move in {bench.spool.failed} cannot be completed: "
     assert sum(line.startswith(start) for line in bench.lines) == 1
 
 

@@ -16,9 +16,7 @@ from bodycap_batch.store.artefacts import Store
 from bodycap_batch.store.garbage_collection import collect_garbage
 from bodycap_batch.watch import cancel_job, commands, inbox_claim, job_worker, retry_job
 from bodycap_batch.watch.inbox_entries import InboxEntry, take_snapshot
-from bodycap_batch.watch.job_status import JobStatusFile
-from bodycap_batch.watch.process_identity import process_tag
-from bodycap_batch.watch.spool import CLAIM_PREFIX, RETRY_PREFIX, JobDir
+from bodycap_batch.watch.spool import RETRY_PREFIX, JobDir
 from tests.pipeline.spools import SpoolFixture, wait_for
 
 
@@ -98,19 +96,26 @@ def test_the_second_of_two_retries_is_an_error(bench: SpoolFixture, monkeypatch:
     assert first[0].read_text() == "capture: {}"
 
 
-def test_a_watcher_finishes_a_killed_retry_but_not_a_running_one(
-    bench: SpoolFixture,
+def test_a_watcher_finishes_a_killed_retry(bench: SpoolFixture) -> None:
+    (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
+    assert bench.run_once() == 2
+    bench.job("walk").path.rename(bench.spool.failed / f"{RETRY_PREFIX}walk")
+    inbox_claim.finish_interrupted_retries(bench.spool)
+    assert [path.name for path in bench.spool.inbox.iterdir()] == ["walk.yaml"]
+    assert list(bench.spool.failed.iterdir()) == []
+
+
+def test_a_watcher_may_finish_a_retry_that_is_still_at_work(
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (bench.spool.inbox / "walk.yaml").write_text("capture: {}")
     assert bench.run_once() == 2
-    job = bench.job("walk")
-    alive = JobDir(job.path.rename(bench.spool.failed / f"{RETRY_PREFIX}{process_tag()}-1"))
-    inbox_claim.finish_interrupted_retries(bench.spool)
-    assert alive.input.is_dir()
-    machine, pid, start = process_tag().split("-")
-    alive.path.rename(bench.spool.failed / f"{RETRY_PREFIX}{machine}-{pid}-{int(start) - 1}-1")
-    inbox_claim.finish_interrupted_retries(bench.spool)
-    assert [path.name for path in bench.spool.inbox.iterdir()] == ["walk.yaml"]
+    finish = preceded_by(
+        commands.return_to_inbox, lambda: inbox_claim.finish_interrupted_retries(bench.spool)
+    )
+    monkeypatch.setattr(commands, "return_to_inbox", finish)
+    assert retry_job(bench.spool, "walk") == bench.spool.inbox / "walk.yaml"
+    assert (bench.spool.inbox / "walk.yaml").read_text() == "capture: {}"
     assert list(bench.spool.failed.iterdir()) == []
 
 
@@ -124,7 +129,7 @@ def test_a_running_watcher_finishes_a_killed_retry(
     thread.start()
     try:
         wait_for((bench.spool.failed / "walk" / "status.json").is_file)
-        (bench.spool.failed / "walk").rename(bench.spool.failed / f"{RETRY_PREFIX}killed-1-1-x")
+        (bench.spool.failed / "walk").rename(bench.spool.failed / f"{RETRY_PREFIX}walk")
         wait_for((bench.spool.failed / "walk" / "status.json").is_file)  # the job has run again
     finally:
         watcher.stop()
@@ -132,52 +137,24 @@ def test_a_running_watcher_finishes_a_killed_retry(
     assert sum(line.startswith("walk: failed") for line in bench.lines) == 2
 
 
-@pytest.mark.parametrize("moment", ["before it is moved", "while it has no name"])
 def test_a_job_that_is_claimed_during_the_cancellation_is_cancelled(
-    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch, moment: str
+    bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The job waits when it is searched, and is gone when it is moved."""
     entry = InboxEntry(bench.drop("walk"))
     snapshot, permissions = take_snapshot(entry, 100), bench.options().permissions
-    asked = threading.Event()
-    cancelled: list[JobDir | None] = []
 
-    def cancel() -> None:
-        cancelled.append(cancel_job(bench.spool, "walk", wait_s=1.0))
-
-    if moment == "before it is moved":  # it waits when it is searched, and is gone when it is moved
-
-        def claim() -> None:
-            monkeypatch.undo()
-            monkeypatch.chdir(bench.folder)
-            assert inbox_claim.claim_entry(bench.spool, entry, snapshot, permissions) is not None
-
-        rename = commands.os.rename  # type: ignore[attr-defined]
-        monkeypatch.setattr(commands.os, "rename", preceded_by(rename, claim))  # type: ignore[attr-defined]
-        cancel()
-    else:
-        thread = threading.Thread(target=cancel)
-
-        def ask() -> None:
-            thread.start()
-            asked.wait(0.5)  # meanwhile the command finds neither an entry nor a job
-
-        monkeypatch.setattr(inbox_claim, "move_to_running", preceded_by(inbox_claim.move_to_running, ask))
+    def claim() -> None:
+        monkeypatch.undo()
+        monkeypatch.chdir(bench.folder)
         assert inbox_claim.claim_entry(bench.spool, entry, snapshot, permissions) is not None
-        thread.join()
-    assert cancelled == [None], "no watcher has reacted yet"
-    assert bench.job("walk").cancel.exists()
-    assert [path.name for path in bench.spool.running.iterdir()] == ["walk"]
 
-
-def test_a_half_claimed_job_can_be_cancelled(bench: SpoolFixture) -> None:
-    job_dir = JobDir(bench.spool.running / f"{CLAIM_PREFIX}1")
-    job_dir.path.mkdir()
-    bench.drop("walk").rename(job_dir.input)
-    JobStatusFile(job_dir).update(dropped="walk")
-    assert cancel_job(bench.spool, "walk", wait_s=0.0) is None, "no watcher has reacted yet"
-    bench.run_once()
-    assert bench.status("walk")["state"] == "cancelled"
-    assert (bench.job("walk").input / "torso.mp4").is_file()
+    rename = commands.os.rename  # type: ignore[attr-defined]
+    monkeypatch.setattr(commands.os, "rename", preceded_by(rename, claim))  # type: ignore[attr-defined]
+    assert cancel_job(bench.spool, "walk", wait_s=0.2) is None, "no watcher has reacted yet"
+    (path,) = bench.spool.running.iterdir()
+    assert JobDir(path).cancel.exists()
+    assert list(bench.spool.failed.iterdir()) == []
 
 
 def test_a_job_that_ends_during_the_cancellation_is_done(

@@ -10,10 +10,8 @@ import asyncio
 import ipaddress
 import logging
 import resource
-import socket
-from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal
 
 import h11
@@ -21,15 +19,12 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 SWEEP_PERIOD_S = 1
 """Minimum time (seconds) between two searches for connections without progress. Evidence: none."""
-ACCEPT_BATCH = 128
-"""Maximum number of connections that wait until the server accepts them. The event loop also accepts at most
-this number at a time. If no file descriptor is free, the event loop reports each failed attempt of a batch.
-Evidence: none."""
 _MAX_CONNECTIONS = 256
 """Maximum number of open connections. Evidence: none."""
 _DESCRIPTORS_PER_CONNECTION = 4
 """Number of file descriptors of the process for each permitted connection. A connection uses at most two, one
-for itself and one for a file. The server therefore uses at most half of the descriptors."""
+for itself and one for a file, and as many new ones may wait to be closed. The server therefore uses at most
+three quarters of the descriptors."""
 _ADDRESS_SHARE = 4
 """Ratio of the number of all connections to the number of connections of one client address. A browser opens
 at most six connections to one server. Evidence: none."""
@@ -44,8 +39,6 @@ Phase = Literal["header", "body", "answer", "close"]
 TIME_LIMITS_S: dict[Phase, float] = {"header": 10.0, "body": 30.0, "answer": 60.0, "close": 10.0}
 """Maximum time (seconds) of a connection in each phase. In the phases "body" and "answer", the time starts
 again with each progress. Evidence: none."""
-
-_logger = logging.getLogger("uvicorn.error")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,75 +63,33 @@ def connection_limits() -> ConnectionLimits:
     return ConnectionLimits(total=total, per_address=max(1, total // _ADDRESS_SHARE))
 
 
-class LimitedListener(socket.socket):
-    """A listening socket that closes a new connection at once if too many connections are open.
-
-    Only the event loop's thread may accept and close connections.
-
-    Args:
-        listener: Listening socket. This object takes over its file descriptor.
-        limits: Maximum numbers of open connections.
-    """
-
-    def __init__(self, listener: socket.socket, limits: ConnectionLimits) -> None:
-        super().__init__(listener.family, listener.type, listener.proto, fileno=listener.detach())
-        self._limits = limits
-        self._open: Counter[str] = Counter()
-
-    def accept(self) -> tuple[socket.socket, Any]:
-        """Return the next connection and the address of the client.
-
-        Raises:
-            BlockingIOError: No connection waits, or the connection was closed because of a limit. The event
-                loop tries again when the next connection waits.
-        """
-        connection, address = super().accept()
-        client = _client_of(address)
-        in_all = self._open.total()
-        if in_all >= self._limits.total or self._open[client] >= self._limits.per_address:
-            connection.close()
-            _logger.warning(
-                "closed a new connection of %s: %d connections are open, %d of them from this address "
-                "(limits: %d and %d)",
-                client,
-                in_all,
-                self._open[client],
-                self._limits.total,
-                self._limits.per_address,
-            )
-            raise BlockingIOError
-        self._open[client] += 1
-        return _CountedConnection(connection, lambda: self._release(client)), address
-
-    def _release(self, client: str) -> None:
-        self._open[client] -= 1
-        if not self._open[client]:
-            del self._open[client]
-
-
-class _CountedConnection(socket.socket):
-    """A connection that calls a function once when it is closed."""
-
-    def __init__(self, connection: socket.socket, when_closed: Callable[[], None]) -> None:
-        super().__init__(connection.family, connection.type, connection.proto, fileno=connection.detach())
-        self._when_closed: Callable[[], None] | None = when_closed
-
-    def close(self) -> None:
-        super().close()
-        if self._when_closed is not None:
-            self._when_closed()
-            self._when_closed = None
-
-
 class LimitedConnection(H11Protocol):
-    """An HTTP connection that ends if the client makes no progress (see `TIME_LIMITS_S`)."""
+    """An HTTP connection that ends at once if too many are open, or if the client makes no progress.
+
+    The limits are those of `connection_limits` and of `TIME_LIMITS_S`.
+    """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        self.client_network = ""
         self._received = 0
         self._resumptions = 0
         self._progress: tuple[Phase, object] | None = None
         self._since_s = 0.0
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Accept a new connection, or close it if too many connections are open."""
+        super().connection_made(transport)
+        self.client_network = _network_of(str(self.client[0] if self.client else ""))
+        others = [
+            each for each in self.connections if isinstance(each, LimitedConnection) and each is not self
+        ]
+        same = sum(each.client_network == self.client_network for each in others)
+        limits = connection_limits()
+        if len(others) >= limits.total or same >= limits.per_address:
+            _report_limits(limits)
+            self.connections.discard(self)
+            transport.abort()
 
     def data_received(self, data: bytes) -> None:
         """Count and process data from the client."""
@@ -175,7 +126,17 @@ class LimitedConnection(H11Protocol):
         return None
 
 
-async def close_connections_without_progress(connections: set[Any]) -> None:
+@cache
+def _report_limits(limits: ConnectionLimits) -> None:
+    """Tell the operator, once in a process, that connections above the limits are closed."""
+    logging.getLogger(__name__).warning(
+        "new connections to the live page are closed at once while %d are open, or %d from one address",
+        limits.total,
+        limits.per_address,
+    )
+
+
+def close_connections_without_progress(connections: set[Any]) -> None:
     """Close the connections whose clients have made no progress for too long.
 
     Args:
@@ -186,9 +147,12 @@ async def close_connections_without_progress(connections: set[Any]) -> None:
         connection.close_without_progress(now_s)
 
 
-def _client_of(address: tuple[Any, ...]) -> str:
+def _network_of(address: str) -> str:
     """Return the text by which connections of one client are counted: its address, or its IPv6 network."""
-    found = ipaddress.ip_address(address[0])
+    try:
+        found = ipaddress.ip_address(address)
+    except ValueError:  # a connection that has ended already has no address
+        return ""
     if found.version == 4:
         return str(found)
     return str(ipaddress.ip_network((int(found), _IPV6_PREFIX_BITS), strict=False))

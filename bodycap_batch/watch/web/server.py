@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import socket
 import threading
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import replace
 
 from bodycap_batch.config.limits import Limits
@@ -15,15 +13,10 @@ from bodycap_batch.core.errors import JobError
 from bodycap_batch.watch.spool import Spool
 from bodycap_batch.watch.web.access import Access
 from bodycap_batch.watch.web.job_list import JobList
-from bodycap_batch.watch.web.log_rate import limited_message_rate
 from bodycap_batch.watch.web.uploads import Uploads, remove_abandoned_uploads
 
 _SHUTDOWN_S = 2
 """Maximum time (seconds) that open connections have to end at a shutdown. Evidence: none."""
-_UPLOAD_CHECK_PERIOD_S = 30.0
-"""Time (seconds) between two searches for uploads that receive no data. Evidence: none."""
-_LOGGERS = ("uvicorn.error", "asyncio")
-"""Names of the loggers whose messages clients can cause."""
 
 
 class LivePage:
@@ -56,45 +49,42 @@ class LivePage:
     def __enter__(self) -> LivePage:
         """Start the server."""
         import uvicorn
+        from starlette.concurrency import run_in_threadpool
 
         from bodycap_batch.watch.web.app import make_app
         from bodycap_batch.watch.web.connections import (
-            ACCEPT_BATCH,
             SWEEP_PERIOD_S,
             LimitedConnection,
-            LimitedListener,
             close_connections_without_progress,
             connection_limits,
         )
 
         remove_abandoned_uploads(self._spool.inbox)
-        self._socket = LimitedListener(self._socket, connection_limits())
         app = make_app(self._job_list, self.access, self._uploads, self._stopped)
         config = uvicorn.Config(
             app,
-            loop="asyncio",  # another event loop would not call `LimitedListener.accept`
             http=LimitedConnection,
-            log_level="warning",
+            log_level="error",  # clients can cause warnings, and must not fill the disk with them
             access_log=False,
             lifespan="off",
             server_header=False,
             proxy_headers=False,
             ws="none",
-            backlog=ACCEPT_BATCH,
+            backlog=connection_limits().total,  # the event loop accepts this number at a time
             timeout_graceful_shutdown=_SHUTDOWN_S,
             timeout_notify=SWEEP_PERIOD_S,
         )
         self._server = uvicorn.Server(config)
-        config.callback_notify = functools.partial(
-            close_connections_without_progress, self._server.server_state.connections
-        )
-        self._running = ExitStack()
-        self._running.enter_context(limited_message_rate(*_LOGGERS))
+
+        async def tidy() -> None:
+            close_connections_without_progress(self._server.server_state.connections)
+            await run_in_threadpool(self._uploads.remove_idle)
+
+        config.callback_notify = tidy
         self._thread = threading.Thread(
             target=self._server.run, kwargs={"sockets": [self._socket]}, name="live page", daemon=True
         )
         self._thread.start()
-        threading.Thread(target=self._remove_idle_uploads, name="idle uploads", daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -103,11 +93,6 @@ class LivePage:
         self._thread.join(2 * _SHUTDOWN_S)
         self._socket.close()
         self._uploads.clear()
-        self._running.close()
-
-    def _remove_idle_uploads(self) -> None:
-        while not self._stopped.wait(_UPLOAD_CHECK_PERIOD_S):
-            self._uploads.remove_idle()
 
 
 def _listen(access: Access) -> socket.socket:

@@ -18,7 +18,7 @@ from bodycap_batch.config.sample_files import SAMPLE_SUFFIXES
 from bodycap_batch.core.errors import CaptureError, JobError, StoreError
 from bodycap_batch.store.artefacts import disk_errors
 from bodycap_batch.watch.inbox_entries import READY
-from bodycap_batch.watch.spool import Spool, folder_name_from_text, move_to_free_name
+from bodycap_batch.watch.spool import MAX_NAME_BYTES, Spool, folder_name_from_text, move_to_free_name
 from bodycap_batch.watch.web.questions import write_answers
 
 _PREFIX = ".upload-"
@@ -30,9 +30,6 @@ _MAX_OTHER_BYTES = 64 << 20
 """Maximum size (bytes) of a file that is not a video: job, calibration, timestamps, mask, skeleton. Evidence:
 none."""
 _NAME = re.compile(r"[^/\\\x00-\x1f\x7f.][^/\\\x00-\x1f\x7f]*")
-_MAX_NAME_BYTES = 200
-"""Maximum length (bytes) of a name. File systems usually permit 255 bytes. The remaining bytes are for the
-suffixes of temporary files."""
 _MIN_FREE_BYTES = 1 << 30
 """Minimum free space (bytes) on the disk after an upload. Evidence: none."""
 _MAX_OPEN_UPLOADS = 8
@@ -282,10 +279,10 @@ def is_accepted(name: str) -> bool:
 
 def _require_short(name: str) -> None:
     """Raise `JobError` if a name is too long for a file or folder."""
-    if (length := len(name.encode(errors="replace"))) > _MAX_NAME_BYTES:
+    if (length := len(name.encode(errors="replace"))) > MAX_NAME_BYTES:
         raise JobError(
             f"the name {name[:40]!r} is too long: {length} bytes",
-            hint=f"use at most {_MAX_NAME_BYTES} bytes, that is, as many letters without accents",
+            hint=f"use at most {MAX_NAME_BYTES} bytes, that is, as many letters without accents",
         )
 
 

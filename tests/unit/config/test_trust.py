@@ -15,7 +15,6 @@ from bodycap_batch.config.limits import Limits, limits_from
 from bodycap_batch.config.models import Job
 from bodycap_batch.config.trust import PathPolicy
 from bodycap_batch.core.errors import CaptureError, JobError
-from bodycap_batch.watch.dropped_job import with_changed_paths
 from bodycap_batch.watch.web.uploads import is_accepted
 from tests.videos import textured_frame, write_video
 
@@ -124,7 +123,7 @@ def test_samples_beside_a_video_are_accepted_moved_and_not_read_from_outside(
     (folder / "torso.gcsv").symlink_to(tmp_path / "secret")
     with pytest.raises(JobError, match="outside"):
         load_job(folder, policy=PathPolicy(folder=folder))
-    moved = with_changed_paths(load_job(folder), lambda path: Path("input") / path.name)
+    moved = load_job(folder).with_paths(lambda path: Path("input") / path.name)
     assert moved.capture.cameras[0].samples == Path("input/torso.gcsv")
 
 

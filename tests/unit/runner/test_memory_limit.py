@@ -10,12 +10,7 @@ import pytest
 
 from bodycap_batch.core.errors import EXIT_BUG, BodycapError, OutOfMemory, error_from_dict
 from bodycap_batch.runner import child_process, memory_limit
-from bodycap_batch.runner.memory_limit import (
-    MemoryGroup,
-    default_limit_mb,
-    is_out_of_memory,
-    machine_memory_mb,
-)
+from bodycap_batch.runner.memory_limit import default_limit_mb, is_out_of_memory, machine_memory_mb
 from tests.unit.runner.test_runner import Bench, a_task
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the limits are those of Linux")
@@ -100,48 +95,11 @@ def test_the_error_survives_the_way_between_processes() -> None:
 
 @pytest.fixture
 def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder that looks like control groups: ``own`` passes the memory controller on to its groups."""
+    """A folder that looks like a control group with a group of this process in it."""
     own = tmp_path / "cgroup" / "own"
     own.mkdir(parents=True)
-    (own / "cgroup.subtree_control").write_text("cpu memory\n")
     monkeypatch.setattr(memory_limit, "_own_group", lambda root: root / "own" / "leaf")
     return own
-
-
-def test_a_control_group_limits_the_child_where_it_can_be_created(groups: Path) -> None:
-    group = MemoryGroup.create(77, groups.parent)
-    assert group is not None
-    folder = groups / "bodycap-77"
-    assert (folder / "cgroup.procs").read_text() == "77"
-    assert (folder / "memory.swap.max").read_text() == "0"
-    assert group.limit(300)
-    assert (folder / "memory.max").read_text() == str(300 << 20)
-    assert group.kills() == 0
-    (folder / "memory.events").write_text("oom 3\noom_kill 1\n")
-    assert group.kills() == 1
-
-
-def test_groups_that_do_not_limit_memory_are_left_alone(groups: Path) -> None:
-    (groups / "cgroup.subtree_control").write_text("cpu\n")
-    assert MemoryGroup.create(77, groups.parent) is None
-    assert [path.name for path in groups.iterdir()] == ["cgroup.subtree_control"]
-
-
-def test_a_child_in_a_control_group_does_not_limit_itself(
-    bench: Bench, groups: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    create = MemoryGroup.create
-    monkeypatch.setattr(MemoryGroup, "create", lambda pid: create(pid, groups.parent))
-    assert bench.with_rules(memory_mb=300).run(a_task("allocate_at_once", mb=1500))[1]
-    (folder,) = groups.glob("bodycap-*")
-    assert (folder / "memory.max").read_text() == str(300 << 20)
-
-    def kill_and_count(group: MemoryGroup) -> int:
-        return next(counts)
-
-    counts = iter(range(100))
-    monkeypatch.setattr(MemoryGroup, "kills", kill_and_count)
-    refusal(bench, 300, "killed")
 
 
 def test_the_limit_of_the_own_group_counts_as_the_machines_memory(

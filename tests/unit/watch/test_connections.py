@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import resource
-import socket
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,10 +15,8 @@ from bodycap_batch.watch.web import connections
 from bodycap_batch.watch.web.connections import (
     ConnectionLimits,
     LimitedConnection,
-    LimitedListener,
     connection_limits,
 )
-from bodycap_batch.watch.web.log_rate import MessageRateLimit
 
 
 @pytest.mark.parametrize(
@@ -34,34 +30,18 @@ def test_most_descriptors_are_left_for_the_jobs(
     assert connection_limits() == ConnectionLimits(total=total, per_address=per_address)
 
 
-@pytest.mark.parametrize("limits", [{"total": 2, "per_address": 9}, {"total": 9, "per_address": 2}])
-def test_a_connection_above_a_limit_is_closed(limits: dict[str, int]) -> None:
-    with LimitedListener(socket.create_server(("127.0.0.1", 0)), ConnectionLimits(**limits)) as listener:
-        clients = [socket.create_connection(listener.getsockname(), timeout=10) for _ in range(4)]
-        first, _ = listener.accept()
-        second, _ = listener.accept()
-        with pytest.raises(BlockingIOError):
-            listener.accept()
-        assert clients[2].recv(1) == b""
-        first.close()
-        first.close()  # a second call does not count
-        third, _ = listener.accept()
-        for connection in (*clients, second, third):
-            connection.close()
-
-
 def test_the_addresses_of_one_ipv6_network_are_one_client() -> None:
-    client_of = connections._client_of
-    assert client_of(("2001:db8:0:1::5", 80, 0, 0)) == client_of(("2001:db8:0:1:ffff::6", 81, 0, 0))
-    assert client_of(("2001:db8:0:1::5", 80, 0, 0)) != client_of(("2001:db8:0:2::5", 80, 0, 0))
-    assert client_of(("10.0.0.1", 80)) != client_of(("10.0.0.2", 80))
+    network_of = connections._network_of
+    assert network_of("2001:db8:0:1::5") == network_of("2001:db8:0:1:ffff::6")
+    assert network_of("2001:db8:0:1::5") != network_of("2001:db8:0:2::5")
+    assert network_of("10.0.0.1") != network_of("10.0.0.2")
 
 
 class Transport(asyncio.Transport):
     """A transport that records what the server does."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, address: str) -> None:
+        super().__init__({"peername": (address, 5000)})
         self.written = b""
         self.aborted = self.closing = False
 
@@ -85,12 +65,14 @@ class Transport(asyncio.Transport):
 class Connection:
     """A connection to an application that reads the body and then answers."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, state: ServerState | None = None, address: str = "10.0.0.1"
+    ) -> None:
         self.loop = loop
-        self.transport = Transport()
+        self.transport = Transport(address)
         config = uvicorn.Config(self.answer, http=LimitedConnection, log_config=None, lifespan="off")
         config.load()
-        self.protocol = LimitedConnection(config, ServerState(), {}, loop)
+        self.protocol = LimitedConnection(config, state or ServerState(), {}, loop)
         self.protocol.connection_made(self.transport)
         self.protocol.close_without_progress(0.0)
 
@@ -112,12 +94,40 @@ class Connection:
 
 
 @pytest.fixture
-def connection() -> Iterator[Connection]:
+def loop() -> Iterator[asyncio.AbstractEventLoop]:
     loop = asyncio.new_event_loop()
     asyncio.set_event_loop(loop)
-    yield Connection(loop)
+    yield loop
     asyncio.set_event_loop(None)
     loop.close()
+
+
+@pytest.fixture
+def connection(loop: asyncio.AbstractEventLoop) -> Connection:
+    return Connection(loop)
+
+
+@pytest.mark.parametrize(("total", "per_address"), [(2, 9), (9, 2)])
+def test_a_connection_above_a_limit_is_closed(
+    loop: asyncio.AbstractEventLoop,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    total: int,
+    per_address: int,
+) -> None:
+    limits = ConnectionLimits(total=total, per_address=per_address)
+    monkeypatch.setattr(connections, "connection_limits", lambda: limits)
+    connections._report_limits.cache_clear()
+    state = ServerState()
+    clients = [Connection(loop, state) for _ in range(4)]
+    assert [client.transport.aborted for client in clients] == [False, False, True, True]
+    assert len(caplog.records) == 1, "reported once"
+    other = Connection(loop, state, "10.0.0.2")
+    assert other.transport.aborted == (total == 2)
+    clients[0].protocol.connection_lost(None)
+    clients[0].protocol.connection_lost(None)  # a second call does not count
+    if total == 2:
+        assert not Connection(loop, state).transport.aborted
 
 
 PUT = b"PUT / HTTP/1.1\r\nHost: x\r\nContent-Length: 10000\r\n\r\n"
@@ -177,18 +187,3 @@ def test_a_closed_connection_that_sends_the_last_data_ends_in_time(connection: C
     connection.transport.close()
     assert not connection.is_closed_at(0)
     assert connection.is_closed_at(11)
-
-
-def test_log_messages_are_limited_and_counted() -> None:
-    now = [0.0]
-    limit = MessageRateLimit(lambda: now[0])
-
-    def passed(level: int = logging.WARNING) -> str:
-        record = logging.LogRecord("web", level, "", 0, "bad request of %s", ("10.0.0.1",), None)
-        return record.getMessage() if limit.filter(record) else ""
-
-    assert [bool(passed()) for _ in range(15)] == [True] * 10 + [False] * 5
-    assert passed(logging.ERROR)  # other levels have their own limit
-    now[0] = 60.0
-    assert passed() == "bad request of 10.0.0.1 (5 earlier messages were left out)"
-    assert passed() == "bad request of 10.0.0.1"

@@ -24,7 +24,7 @@ from bodycap_batch.watch import active_watcher, job_rows, retry_job
 from bodycap_batch.watch.dropped_job import JobPermissions, read_job, write_job
 from bodycap_batch.watch.inbox_claim import dropped_name, input_path, return_to_inbox
 from bodycap_batch.watch.job_status import JobStatusFile, read_status
-from bodycap_batch.watch.spool import CLAIM_PREFIX, JobDir, Spool
+from bodycap_batch.watch.spool import RETRY_PREFIX, JobDir, Spool
 from bodycap_batch.watch.watcher_status import WatcherStatusFile
 
 
@@ -140,7 +140,7 @@ def test_a_flipped_bit_in_the_stored_job_is_never_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
-@pytest.mark.parametrize("name", ["walk", f"{CLAIM_PREFIX}0"])
+@pytest.mark.parametrize("name", ["walk", f"{RETRY_PREFIX}walk"])
 def test_a_job_with_a_damaged_status_returns_to_the_inbox_complete(
     tmp_path: Path, kind: str, name: str
 ) -> None:

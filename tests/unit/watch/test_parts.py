@@ -179,9 +179,9 @@ def test_an_unfinished_copy_delays_a_folder_and_its_job_never_runs(
     ((entry, snapshot),) = tracker.complete_entries(entries_in(spool.inbox))
     claimed = claim_entry(spool, entry, snapshot, JobPermissions())
     assert claimed is not None
-    _, error = claimed
-    assert isinstance(error, CaptureError)
-    assert error.path == str(walk / left)
+    status = json.loads(claimed.status.read_text())
+    assert (status["state"], status["exit_code"]) == ("failed", CaptureError.exit_code)
+    assert status["error"]["path"] == str(spool.failed / "walk" / "input" / left)
 
 
 @pytest.mark.parametrize("left", UNFINISHED)
@@ -385,7 +385,7 @@ def test_a_video_that_is_not_used_is_a_note_of_a_dropped_job(tmp_path: Path) -> 
     entry = InboxEntry(walk)
     claimed = claim_entry(spool, entry, take_snapshot(entry, 100), JobPermissions())
     assert claimed is not None
-    job_dir = claimed[0]
+    job_dir = claimed
     job = read_job(job_dir, JobPermissions())
     assert [camera.name for camera in job.capture.cameras] == ["torso", "left_palm"]
     assert job.capture.cameras_only
