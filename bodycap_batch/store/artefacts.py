@@ -285,10 +285,11 @@ class Store:
         return Artefact(path=path, digest=manifest["digest"], made=manifest["made"], files=manifest["files"])
 
     def _has_digest(self, path: Path, expected: str) -> bool:
-        if not path.is_file():
+        try:
+            large = path.stat().st_size > _REMEMBER_BYTES
+            return (self.digests.sha256(path) if large else file_sha256(path)) == expected
+        except (FileNotFoundError, NotADirectoryError):  # another process may have just moved it away
             return False
-        large = path.stat().st_size > _REMEMBER_BYTES
-        return (self.digests.sha256(path) if large else file_sha256(path)) == expected
 
     def _set_aside(self, path: Path, look: Callable[[], _Found]) -> _Found:
         """Move a damaged artefact away, and return the result of `look`.

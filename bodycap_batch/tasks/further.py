@@ -11,8 +11,8 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.mapping import MAP_MEMORY_MB, save_map
-from bodycap_batch.tasks.registered_cameras import OTHER_PATHS
-from bodycap_batch.tasks.registration import NOT_ROUNDS, replace_registration
+from bodycap_batch.tasks.registered_cameras import OTHER_PATHS, replace_registration
+from bodycap_batch.tasks.registration import NOT_ROUNDS
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
 
 

@@ -9,8 +9,7 @@ from bodycap_batch.config.path_bounds import MAX_WITHDRAWN
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef
 from bodycap_batch.tasks.loading import TRACKS, load_keyframes, load_map, load_registration
-from bodycap_batch.tasks.registered_cameras import OTHER_PATHS
-from bodycap_batch.tasks.registration import replace_registration
+from bodycap_batch.tasks.registered_cameras import OTHER_PATHS, replace_registration
 from bodycap_batch.tasks.stage import Stage, write_summary
 
 

@@ -6,21 +6,58 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bodycap_batch.tasks.loading import load_registration
+from bodycap_batch.tasks.stage import read_summary, write_summary
 
 if TYPE_CHECKING:
     from bodycap_batch.core.arrays import FloatArray
     from bodycap_batch.model.camera_clock import CameraClock, CaptureClocks
     from bodycap_batch.model.inertial_camera import InertialCamera
     from bodycap_batch.model.relative_pose import RelativePose
-    from bodycap_batch.model.scene import Map, Trajectory
+    from bodycap_batch.model.scene import Map, Registration, Trajectory
 
 INERTIAL_CAMERA = "inertial"
 """Name of the file, without suffix, that holds what the inertial sensor of a camera gives."""
 OTHER_PATHS = "other_paths"
 """Name of the file, without suffix, that holds the poses of a camera in other maps than that of its path."""
+
+
+def replace_registration(found: Registration, before: Path, files: Path, **summary: Any) -> None:
+    """Store poses in place of stored ones; the rest of the camera's registration stays as it is.
+
+    Args:
+        found: Poses and observations of the camera.
+        before: Folder of the registration that is replaced.
+        files: Folder of the artefact.
+        summary: Further values of the summary.
+    """
+    from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
+    from bodycap_batch.model.camera import Camera
+    from bodycap_batch.model.camera_clock import FrameTiming
+    from bodycap_batch.model.inertial_camera import InertialCamera
+
+    write_dataclass(found, files, "registration")
+    kinds = {"timing": FrameTiming, "camera": Camera, INERTIAL_CAMERA: InertialCamera}
+    for name, kind in kinds.items():
+        if (before / f"{name}.json").exists():
+            write_dataclass(read_dataclass(kind, before, name), files, name)
+    write_summary(files, **registration_summary(found), rolling=read_summary(before)["rolling"], **summary)
+
+
+def registration_summary(found: Registration) -> dict[str, Any]:
+    """Return the numbers of frames by their outcome, and the frames that should become keyframes."""
+    from bodycap_batch.model.scene import FrameStatus
+
+    path = found.trajectory
+    return {
+        "frames": len(path.status),
+        "localised": int(path.localised.sum()),
+        "rotations": int(path.rotation_only.sum()),
+        "contradicted": path.status.count(FrameStatus.CONTRADICTED),
+        "wanted": [int(frame) for frame in found.wanted_keyframes],
+    }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bodycap_batch.config.options import RegistrationOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
-from bodycap_batch.tasks.registered_cameras import INERTIAL_CAMERA
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, read_summary, write_summary
+from bodycap_batch.tasks.registered_cameras import registration_summary
+from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
 from bodycap_batch.tasks.typed_json import omitted_from_key
 
 if TYPE_CHECKING:
@@ -105,43 +105,7 @@ def save_registration(
     timing = FrameTiming(nominal_fps=camera.nominal_fps, rolling_shutter_s=camera.rolling_shutter_s)
     write_dataclass(timing, files, "timing")
     write_dataclass(camera.camera, files, "camera")
-    write_summary(files, **_summary_of(found), rolling=rolling, notes=list(notes))
-
-
-def replace_registration(found: Registration, before: Path, files: Path, **summary: Any) -> None:
-    """Store poses in place of stored ones; the rest of the camera's registration stays as it is.
-
-    Args:
-        found: Poses and observations of the camera.
-        before: Folder of the registration that is replaced.
-        files: Folder of the artefact.
-        summary: Further values of the summary.
-    """
-    from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
-    from bodycap_batch.model.camera import Camera
-    from bodycap_batch.model.camera_clock import FrameTiming
-    from bodycap_batch.model.inertial_camera import InertialCamera
-
-    write_dataclass(found, files, "registration")
-    kinds = {"timing": FrameTiming, "camera": Camera, INERTIAL_CAMERA: InertialCamera}
-    for name, kind in kinds.items():
-        if (before / f"{name}.json").exists():
-            write_dataclass(read_dataclass(kind, before, name), files, name)
-    write_summary(files, **_summary_of(found), rolling=read_summary(before)["rolling"], **summary)
-
-
-def _summary_of(found: Registration) -> dict[str, Any]:
-    """Return the numbers of frames by their outcome, and the frames that should become keyframes."""
-    from bodycap_batch.model.scene import FrameStatus
-
-    path = found.trajectory
-    return {
-        "frames": len(path.status),
-        "localised": int(path.localised.sum()),
-        "rotations": int(path.rotation_only.sum()),
-        "contradicted": path.status.count(FrameStatus.CONTRADICTED),
-        "wanted": [int(frame) for frame in found.wanted_keyframes],
-    }
+    write_summary(files, **registration_summary(found), rolling=rolling, notes=list(notes))
 
 
 REGISTRATION = Stage(

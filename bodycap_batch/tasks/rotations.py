@@ -11,7 +11,7 @@ from bodycap_batch.config.path_bounds import MAX_CONTRADICTED, MAX_UNCERTAINTY
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
-from bodycap_batch.tasks.registration import replace_registration
+from bodycap_batch.tasks.registered_cameras import replace_registration
 from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
 
 if TYPE_CHECKING:

@@ -21,8 +21,16 @@ _CLASSES = {
     PartState.UNMEASURED: "unknown",
 }
 """Class of a bone in the style sheet, by its state."""
-_THIN = {"Hand": 9.0, "Foot": 10.0, "ToeBase": 8.0, "Neck": 11.0, "Shoulder": 11.0}
-_THICKNESS = _THIN | {"Hips": 24.0, "Spine": 24.0, "Spine1": 26.0}
+_THICKNESS = {
+    "Hand": 9.0,
+    "Foot": 10.0,
+    "ToeBase": 8.0,
+    "Neck": 11.0,
+    "Shoulder": 11.0,
+    "Hips": 24.0,
+    "Spine": 24.0,
+    "Spine1": 26.0,
+}
 """Thickness of some bones, SVG units. It is a matter of taste."""
 _THICK = 14.0
 """Thickness of all other bones, SVG units."""

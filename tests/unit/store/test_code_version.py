@@ -79,7 +79,7 @@ HASHED = {
         CAMERAS | {"mapping", "registration", "inertial", "telemetry"},
     ),
     "links": CAMERAS | {"evaluate", "tracks"},
-    "rotations": CAMERAS | {"registration", "inertial", "telemetry", "tracks"},
+    "rotations": CAMERAS | {"tracks"},
     # Merging reads marker boards from the images, and explains a failure by mirrored cameras.
     "merge": BODY | {"merging", "calibration", "mapping"},
     "fill": BODY | {"fill"},
@@ -170,8 +170,8 @@ def test_code_for_output_does_not_count(copied: Path) -> None:
 
 
 def test_the_conditions_of_recovery_count(copied: Path) -> None:
-    # All that store a registration, and the maps of lost frames.
-    stages = {"registration", "recover", "rotations", "inertial", *MAPPING}
+    # All that register frames, and the maps of lost frames.
+    stages = {"registration", "recover", "inertial", *MAPPING}
     assert changed_by(copied / "config" / "lost_frames.py") == stages
 
 

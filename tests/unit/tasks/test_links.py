@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 
+from bodycap_batch.core import mechanisms
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
@@ -141,7 +141,10 @@ def test_poses_in_other_maps_are_withdrawn_and_the_path_says_so(tmp_path: Path) 
     assert np.array_equal(other.localised, ~inside & ~gone)
 
 
-def test_without_the_mechanism_the_poses_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("BODYCAP_WITHOUT", "withdrawn_poses")
-    out = compare(tmp_path, path_of(leap()))
+def test_without_the_mechanism_the_poses_stay(tmp_path: Path) -> None:
+    mechanisms.begin_task({mechanisms.KEY_OPTION: ["withdrawn_poses"]})
+    try:
+        out = compare(tmp_path, path_of(leap()))
+    finally:
+        mechanisms.begin_task({})
     assert read_summary(out)["withdrawn"] == 0 < read_summary(out)["links"][0]["contradicted"]
