@@ -58,7 +58,6 @@ class Mechanism(StrEnum):
     FURTHER_MAPS = "further_maps"
     PURE_ROTATION = "pure_rotation"
     FREED_LENSES = "freed_lenses"
-    WITHDRAWN_POSES = "withdrawn_poses"
     CONTINUITY = "continuity"
     MOUNT_SLIPS = "mount_slips"
     LYING = "lying"

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.evaluate.fresh_features import FrameFeatures, features_at
 from bodycap_batch.evaluate.right_frames import (
     Pictures,
@@ -82,22 +82,6 @@ def count_frames(found: RightFrames) -> dict[str, Any]:
         "contradicted": len(wrong),
         "contradicted_frames": [min(wrong), max(wrong)] if wrong else [],
     }
-
-
-def contradicted_frames(found: RightFrames) -> BoolArray:
-    """Return for each frame (N,) whether the tracks contradict its pose.
-
-    A frame that was not compared counts as contradicted if the nearest compared frames before and after it
-    are, or the only one of them that exists.
-    """
-    wrong = np.array([each is Outcome.WRONG for each in found.outcome])
-    compared = np.flatnonzero([each in (Outcome.WRONG, Outcome.RIGHT) for each in found.outcome])
-    if not wrong.any():
-        return wrong
-    frames = np.arange(len(wrong))
-    before = compared[np.maximum(np.searchsorted(compared, frames, side="right") - 1, 0)]
-    after = compared[np.minimum(np.searchsorted(compared, frames), len(compared) - 1)]
-    return np.asarray(wrong[before] & wrong[after])
 
 
 def _features(tracks: PointTracks, lens: Camera, frame: int) -> FrameFeatures | None:

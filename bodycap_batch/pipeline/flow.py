@@ -471,18 +471,6 @@ class Flow:
             for name, registration in registrations.items()
         )
 
-    def without_contradicted(self, registrations: ByCamera, links: ByCamera) -> ByCamera:
-        """Return the registrations without the poses that the tracks of the videos contradict.
-
-        Args:
-            registrations: The registrations that were compared.
-            links: What the tracks show about them.
-        """
-        return {
-            name: links[name] if read_summary(links[name].path)["withdrawn"] else each
-            for name, each in registrations.items()
-        }
-
     def with_freed_lenses(self, links: ByCamera) -> Flow | None:
         """Return the flow of the same job with unknown lenses, for cameras whose path the video contradicts.
 

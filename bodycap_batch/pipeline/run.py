@@ -133,7 +133,6 @@ def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
     except EstimationError:  # there is no map
         results.stage, results.map, results.clocks, results.registrations = "map", None, None, {}
         raise
-    results.registrations = flow.without_contradicted(results.registrations, results.links)
     yield "registration"
     results.stage = "merge"
     if results.failure is None:

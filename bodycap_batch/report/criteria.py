@@ -92,10 +92,9 @@ CAMERA_RULES = (
         name="Links of the video",
         read=readings.read_links,
         bounds=Bounds(good=0.02, fair=MAX_CONTRADICTED),
-        finding="{camera}: the video contradicts {percent} of the compared frames{where}{withdrawn}",
+        finding="{camera}: the video contradicts {percent} of the compared frames{where}",
         rationale="Points are followed through the video without any map. They show how the camera turned "
-        "and moved from frame to frame, and where a path folds, leaps or changes its scale. A small part "
-        "that they contradict is withdrawn, but the rest of such a map deserves less trust.",
+        "and moved from frame to frame, and where a path folds, leaps or changes its scale.",
         action="Turn more slowly, keep near and far things with texture in view, and point the camera away "
         "from the wearer's own body.",
         priority=1.8,

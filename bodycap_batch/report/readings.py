@@ -208,12 +208,7 @@ def read_links(metrics: Metrics) -> Reading | None:
         for path in metrics["mapping"]["links"][name]
         if path["contradicted"]
     ]
-    withdrawn = sum(path.get("withdrawn", 0) for path in metrics["mapping"]["links"][name])
-    words = {
-        "camera": name,
-        "where": f" ({'; '.join(where)})" if where else "",
-        "withdrawn": f"; {withdrawn} poses are withdrawn for it" if withdrawn else "",
-    }
+    words = {"camera": name, "where": f" ({'; '.join(where)})" if where else ""}
     return Reading(value=share, metric=metric_path("mapping", "links", name), words=words)
 
 

@@ -207,7 +207,7 @@ def linked(options: Json, arguments: Json, files: Path) -> None:
     lens = Path(arguments["keyframes"]["path"]) / "calibration.json"
     wrong = orders().get("wrong", {}).get(json.loads(lens.read_text()), 0)
     link = {"frame": "map", "compared": 20, "contradicted": wrong}
-    values = {"links": [link], "withdrawn": 0, "frame": "map", "posed": posed, "sigma": None, "extent": None}
+    values = {"links": [link], "frame": "map", "posed": posed, "sigma": None, "extent": None}
     (files / "summary.json").write_text(json.dumps(values))
 
 

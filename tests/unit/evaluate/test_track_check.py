@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.evaluate.right_frames import RightFrames
 from bodycap_batch.evaluate.track_check import (
     TrackedVideo,
     check_with_tracks,
-    contradicted_frames,
     count_frames,
 )
 from bodycap_batch.evaluate.two_view import Outcome
@@ -81,23 +79,3 @@ def test_a_rolling_shutter_needs_the_turns_of_the_known_poses(seen: TrackedVideo
     path[10:12] = np.nan
     rolling = TrackedVideo(tracks=seen.tracks, lens=LENS, times_s=seen.times_s, readout_s=1e-4)
     assert count_frames(check_with_tracks(rolling, path))["contradicted"] == 0
-
-
-def test_a_frame_between_contradicted_frames_is_contradicted_itself() -> None:
-    right, wrong = Outcome.RIGHT, Outcome.WRONG
-    outcome = (
-        None,
-        wrong,
-        Outcome.UNMEASURABLE,
-        wrong,
-        None,
-        right,
-        None,
-        right,
-        Outcome.UNMEASURABLE,
-        wrong,
-    )
-    found = contradicted_frames(RightFrames(outcome=outcome, links={}, legs={}))
-    assert np.flatnonzero(found).tolist() == [0, 1, 2, 3, 9]
-    none = contradicted_frames(RightFrames(outcome=(right, None), links={}, legs={}))
-    assert not none.any()
