@@ -39,8 +39,7 @@ _ROUNDS = 2
 _MIN_PAIR_BUDGET = 2000
 """Number of untried pairs that a round of a repair may match in any case. The round may match a larger number
 of untried pairs only if at least that number of pairs was matched before. Otherwise the round matches only
-the pairs of misregistered keyframes. If these are too many as well, nothing is repaired. Evidence:
-docs/decisions/mapping.md."""
+the pairs of misregistered keyframes. Evidence: none."""
 _CONFIRMED_ERROR_RATIO = 2.0
 """Maximum error of a match that confirms the pose of a keyframe, as a multiple of the mapper's maximum
 reprojection error. Of 6, 8 and 12 px, all confirm the same keyframes within a few percent. Evidence:
@@ -86,14 +85,10 @@ def repair_model(
         if not wrong | missing:
             break
         untried = _untried_pairs(ids, wrong | missing, tried)
-        budget = max(_MIN_PAIR_BUDGET, len(tried))
-        if len(untried) > budget:
+        if len(untried) > max(_MIN_PAIR_BUDGET, len(tried)):
             # If many keyframes are missing, most of the missing keyframes show too little of the room to be
             # registered, and matching them takes long. So only misregistered keyframes are matched.
             untried = _untried_pairs(ids, wrong, tried)
-        if len(untried) > budget:
-            # Most of the map is doubtful: its keyframes were matched with all that look similar.
-            break
         tried |= set(untried)
         verified = match_pairs(context.workspace, untried, context.intrinsics, context.stage)
         entry: dict[str, object] = {

@@ -39,7 +39,6 @@ from bodycap_batch.mapping.reconstruction.initial_pair import find_user_pair, ra
 from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
 from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
 from bodycap_batch.mapping.results import finalise_models
-from bodycap_batch.mapping.validation import repair
 from bodycap_batch.mapping.validation.epipolar_consistency import (
     PairConsistency,
     evaluate_pairs,
@@ -183,20 +182,6 @@ def test_a_block_of_another_scale_or_place_is_found_and_repaired(
     assert _rms(mended, poses) < 0.01
     assert mended.num_reg_images() == KEYFRAMES
     assert log["cut"] == []
-
-
-def test_nothing_is_matched_again_if_most_of_the_map_is_doubtful(
-    built: tuple[Any, FloatArray, MappingContext, set[Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All pairs of the doubtful keyframes are more than were matched before."""
-    monkeypatch.setattr(repair, "_MIN_PAIR_BUDGET", 10)
-    model, _, mapping, _ = built
-    numbers = {ImageRef.parse(model.image(i).name).frame: int(i) for i in model.reg_image_ids()}
-    offset = Similarity(1.0, np.eye(3), np.array([0.0, 0.0, 1.0]))
-    wrong = misplace(model, [numbers[frame] for frame in _MOVED], offset)
-    left, log = repair_model(wrong, set(), mapping)
-    assert log["rounds"] == []
-    assert len(log["cut"]) == KEYFRAMES - left.num_reg_images() == len(_MOVED)
 
 
 def _with_blurred_block(model: Any, block: list[int]) -> Any:
