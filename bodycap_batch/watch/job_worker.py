@@ -113,9 +113,8 @@ class JobWorker:
 
     def _process(self, job_dir: JobDir) -> JobOutcome:
         previous = read_status(job_dir, strict=True)
-        if (
-            previous.get("state") in FINAL
-        ):  # it could not be read, or an earlier watcher ended before the move
+        if previous.get("state") in FINAL:
+            # The job could not be read, or an earlier watcher ended before it moved the job.
             return self._file(job_dir, previous["state"], _error_from_status(previous), None)
         status = JobStatusFile(job_dir, previous)
         try:
