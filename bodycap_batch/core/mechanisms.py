@@ -36,8 +36,6 @@ class Mechanism(StrEnum):
     RECALIBRATION = "recalibration"
     READOUT_PROFILE = "readout_profile"
     REFINEMENT = "refinement"
-    SECOND_REFINEMENT = "second_refinement"
-    REBUILT_MAP = "rebuilt_map"
     JOINT_VELOCITIES = "joint_velocities"
     EQUAL_CAMERAS = "equal_cameras"
     MISPLACED_KEYFRAMES = "misplaced_keyframes"

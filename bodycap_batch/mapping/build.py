@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +30,8 @@ from bodycap_batch.mapping.intrinsics.recalibration import recalibrate_if_misfit
 from bodycap_batch.mapping.intrinsics.shutters import (
     known_readouts,
     possible_readouts,
-    readouts_of_maps,
     turning_shutters,
-    unknown_shutters,
+    uncorrected_shutters,
     with_gyroscopes,
     write_shutters,
 )
@@ -65,37 +64,6 @@ _MIN_MOTION_PX = 2.0
 docs/decisions/mapping.md."""
 
 
-@dataclass(frozen=True, slots=True)
-class EarlierResults:
-    """What earlier maps of the same capture give for a new one.
-
-    Attributes:
-        features: By camera name, the workspace of a map that holds the features of the camera's keyframes.
-        readouts: By camera name, the readout time for which the keypoints are corrected.
-    """
-
-    features: Mapping[str, Path] = field(default_factory=dict)
-    readouts: Mapping[str, Readout] = field(default_factory=dict)
-
-
-NOTHING_EARLIER = EarlierResults()
-"""There is no earlier map."""
-
-
-def earlier_results(capture: Capture, refined: MapResult | None) -> EarlierResults:
-    """Return what an earlier map of a capture gives for a new one.
-
-    Args:
-        capture: All cameras.
-        refined: A map of the same pictures, in which rolling shutters were found. The keypoints are corrected
-            for its readout times, and all features are taken from it. None if there is no such map.
-    """
-    if refined is None:
-        return NOTHING_EARLIER
-    names = [camera.name for camera in capture.cameras]
-    return EarlierResults(dict.fromkeys(names, refined.workspace), readouts_of_maps(refined.maps))
-
-
 def build_map(
     capture: Capture,
     selections: Sequence[KeyframeSelection],
@@ -103,7 +71,6 @@ def build_map(
     context: StageContext,
     *,
     skeletal_above: int = SKELETAL_ABOVE,
-    earlier: EarlierResults = NOTHING_EARLIER,
 ) -> MapResult:
     """Reconstruct the room and the keyframe poses by incremental structure from motion.
 
@@ -118,7 +85,6 @@ def build_map(
         skeletal_above: Maximum number of keyframes of a map that is built from all keyframes at once. A
             larger map is built from skeletal keyframes (the reduced set of keyframes, Snavely's skeletal
             set), and the other keyframes are resected.
-        earlier: What earlier maps of the same capture give.
 
     Returns:
         The models, largest first, each in a separate gauge.
@@ -131,13 +97,13 @@ def build_map(
     """
     _require_motion(selections)
     capture = with_estimated_lenses(capture, selections)
-    result, refused = build_map_once(capture, selections, options, context, skeletal_above, earlier)
+    result, refused = build_map_once(capture, selections, options, context, skeletal_above)
     # A map that is built again has the same features.
-    used = replace(earlier, features={item.camera: context.work_dir / WORKSPACE for item in selections})
+    features = context.work_dir / WORKSPACE
     second_context = replace(context, work_dir=context.work_dir / "freed")
 
     def build_again(other: Capture) -> MapResult:
-        again, unusable = build_map_once(other, selections, options, second_context, skeletal_above, used)
+        again, unusable = build_map_once(other, selections, options, second_context, skeletal_above, features)
         if unusable is not None:
             raise unusable
         return again
@@ -154,7 +120,7 @@ def build_map(
             _without_initial_pair_of(camera, options),
             replace(context, work_dir=context.work_dir / "without"),
             skeletal_above,
-            used,
+            features,
         )
         if unusable is not None:
             raise
@@ -185,11 +151,12 @@ def build_map_once(
     options: MapOptions,
     context: StageContext,
     skeletal_above: int,
-    earlier: EarlierResults = NOTHING_EARLIER,
+    earlier: Path | None = None,
 ) -> tuple[MapResult, EstimationError | None]:
     """Build a map with the capture's intrinsics: calibrated intrinsics stay constant, others are refined.
 
-    The arguments are the same as in `build_map`; `earlier` is what earlier maps give.
+    The arguments are the same as in `build_map`; `earlier` is the workspace of an earlier map of the same
+    pictures, which holds the features, or None.
 
     Returns:
         The map; an error with the reason why the map is unusable (too few keyframes, or matches that
@@ -203,7 +170,7 @@ def build_map_once(
     workspace.mkdir(parents=True, exist_ok=True)
     estimated = with_gyroscopes(estimate_from_matches(capture, selections), selections)
     readouts = {**known_readouts(capture), **estimated}
-    used = {**readouts, **possible_readouts(capture, selections, readouts), **earlier.readouts}
+    used = {**readouts, **possible_readouts(capture, selections, readouts)}
     shutters = turning_shutters(capture, selections, used)
     write_shutters(workspace, shutters)
     keyframes = _keyframes_of(workspace, capture, selections, shutters, earlier)
@@ -244,9 +211,10 @@ def build_map_once(
     misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
     if readouts:
         log["readouts_from_matches"] = {name: asdict(item) for name, item in sorted(readouts.items())}
-    unknown = unknown_shutters(capture, selections, readouts)
+    selected = replace(capture, cameras=tuple(capture.camera(item.camera) for item in selections))
+    uncorrected = uncorrected_shutters(selected, readouts, shutters.keys())
     log = MapDiagnostics(
-        misfit_factors=misfits, misplaced=misplaced, unknown_shutters=unknown, details=log
+        misfit_factors=misfits, misplaced=misplaced, uncorrected_shutters=uncorrected, details=log
     ).to_log()
     result = make_result(models, workspace, log)
     result = _with_readouts(result, {name: used[name] for name in shutters})
@@ -263,7 +231,7 @@ def _keyframes_of(
     capture: Capture,
     selections: Sequence[KeyframeSelection],
     shutters: Mapping[str, TurningShutter],
-    earlier: EarlierResults,
+    earlier: Path | None,
 ) -> list[CameraKeyframes]:
     """Write the cameras to a new database, and return the keyframes that are added to it.
 
@@ -272,7 +240,7 @@ def _keyframes_of(
         capture: All cameras.
         selections: Keyframes of each camera.
         shutters: By camera name, what corrects the keypoints for a rolling shutter.
-        earlier: What earlier maps give.
+        earlier: Workspace of an earlier map of the same pictures; None if there is none.
     """
     import pycolmap
 
@@ -285,7 +253,7 @@ def _keyframes_of(
             np.asarray(item.frames),
             _usable_sharpness(item),
             shutters.get(item.camera),
-            earlier.features.get(item.camera),
+            earlier,
         )
         for item in selections
     ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,21 +17,15 @@ from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.inertial.camera_rotation import related_to_poses
 from bodycap_batch.mapping.inputs import calibrated_camera_ids, make_mapping_context
 from bodycap_batch.mapping.intrinsics.readout_time import (
-    STATED,
     Readout,
     RollingShutterModel,
-    estimate_readouts,
     groups_of_equal_cameras,
     map_with_readouts,
     sideways_cameras,
     stated_readout,
 )
 from bodycap_batch.mapping.intrinsics.recalibration import with_map_intrinsics
-from bodycap_batch.mapping.intrinsics.shutters import (
-    MAX_DISPLACEMENT_PX,
-    read_shutters,
-    readouts_of_maps,
-)
+from bodycap_batch.mapping.intrinsics.shutters import read_shutters, readouts_of_maps
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import read_camera_ids, read_detected_px
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
@@ -64,14 +58,12 @@ def refine_map(
 ) -> MapResult:
     """Correct a map for rolling shutters, with the camera motion that registration estimated.
 
-    Readout times that are not given in the job are estimated from the keyframes. The velocity of each
-    keypoint in the image is computed from the poses of neighbouring frames. With this velocity, the keypoint
-    is moved to its position at the instant of the image's middle row. Then each model is adjusted. If the
-    model was built from corrected keypoints and the velocities from the poses are not exact enough, poses,
-    points and velocities of the keyframes are adjusted together, and the velocities from the poses are their
-    expected values. In the result, the observations are at their detected positions again. `Map.readout_s`
-    holds the readout times with which the correction can be repeated. `MapDiagnostics.distorted_cameras`
-    names the cameras for which the map should be built again from corrected keypoints.
+    Readout times that neither the job nor the matches of adjacent frames determine are estimated from the
+    keyframes. Poses, points, velocities and readout times of the keyframes are adjusted together. Their
+    expected values are the velocities of the path through the poses of all frames. A keypoint is then at its
+    position at the instant of the image's middle row. If the velocities of the path are exact enough, or the
+    model is large, only poses and points are adjusted. In the result, the observations are at their detected
+    positions again. `Map.readout_s` holds the readout times with which the correction can be repeated.
 
     Args:
         capture: All cameras.
@@ -106,7 +98,6 @@ def refine_map(
     from_matches = {name: _readout_of(entry) for name, entry in entries.items()}
     models, all_readouts, adjusted_px, motions = [], [], [], []
     removed = 0
-    distorted: set[str] = set()
     for number, scene_map in enumerate(previous.maps):
         context.check_cancelled()
         context.progress(number, len(previous.maps), "maps refined")
@@ -124,8 +115,6 @@ def refine_map(
         if refined.model.num_points3D() < _MIN_POINT_SHARE * model.num_points3D():
             refined = replace(refinement, mapping=with_constant_lenses).run()
         readouts, corrected_px = refined.readouts, refined.corrected_px
-        readout_s = _seconds(readouts)
-        distorted |= distorted_cameras(refined.rolling, readout_s, scene_map.readout_s.keys())
         removed += refined.removed
         motions.append(refined.rolling.motions(readouts, refined.error_scales))
         models.append(refined.model)
@@ -140,7 +129,6 @@ def refine_map(
     }
     diagnostics = replace(
         previous.diagnostics,
-        distorted_cameras=tuple(sorted(distorted)),
         details={**previous.log, **log},
     )
     result = make_result(models, workspace, diagnostics.to_log(), adjusted_px, motions)
@@ -197,25 +185,16 @@ class _Refinement:
     def run(self) -> _Refined:
         """Return the model after the adjustment with the most exact motion."""
         settings, calibrated_ids = self.mapping.mapper_options(), list(self.mapping.calibrated_ids)
-        if self._readouts_are_decided():
-            rolling = self.rolling.with_sideways(sideways_cameras(self.cameras, self.scene_map))
-            refined = self._with_velocities(rolling, self._readouts())
-            if refined is not None:
-                return refined
-        others = {
-            name: item for name, item in self.from_matches.items() if item.seconds and item.source != STATED
-        }
-        rolling, estimated = estimate_readouts(
-            self.rolling, self.cameras, settings, calibrated_ids, self.scene_map, others
-        )
-        # A camera that was registered against another model keeps the readout time of its keyframes here.
-        readouts = readouts_of_maps([self.scene_map]) | estimated
+        known = self._known_readouts()
+        sideways = {name for name, readout in {**self.from_matches, **known}.items() if readout.sideways}
+        sideways |= sideways_cameras(self.cameras, self.scene_map)
+        rolling = self.rolling.with_sideways(sideways)
+        readouts = {**known, **rolling.find_unknown(known, self.equal_cameras)}
         if not (readout_s := _seconds(readouts)):
-            return _Refined(
-                rolling=rolling, model=self.model, readouts=readouts, corrected_px=None, removed=0
-            )
+            return self._unchanged(rolling, readouts)
         if (refined := self._with_velocities(rolling, readouts)) is not None:
-            return refined
+            is_corrected = _seconds(refined.readouts) or self.scene_map.readout_s
+            return refined if is_corrected else self._unchanged(rolling, refined.readouts)
         model = rolling.with_exact_rates(readout_s, self.scene_map.readout_s.keys()).corrected(readout_s)
         removed = remove_dominant_points(model)
         if self.mapping.is_large(model.num_reg_images()):
@@ -225,47 +204,29 @@ class _Refinement:
             adjust_robustly(model, settings, calibrated_ids)
         return self._finished(rolling, model, readouts, removed)
 
-    def _readouts_are_decided(self) -> bool:
-        """Return True if each camera's readout time is known, from the map or from matches."""
-        own = self.scene_map.cameras.keys()
-        known = self._known_readouts()
-        undecided = {
-            name
-            for name in own - self.scene_map.readout_s.keys()
-            if name not in known or not known[name].determined or known[name].seconds
-        }
-        return bool(self.scene_map.readout_s) and not undecided
-
     def _known_readouts(self) -> dict[str, Readout]:
-        """Return the readout times that are stated or come from matches, by camera name."""
-        stated = {
-            name: stated_readout(camera.rolling_shutter_s)
-            for name, camera in self.cameras.items()
-            if camera.rolling_shutter_known
-        }
-        return {**self.from_matches, **stated}
-
-    def _readouts(self) -> dict[str, Readout]:
-        """Return the readout times of the map, and those of 0 that are stated or come from matches."""
-        own, known = self.scene_map.cameras.keys(), self._known_readouts()
-        of_map = {
-            name: replace(item, source=STATED) if self.cameras[name].rolling_shutter_known else item
-            for name, item in readouts_of_maps([self.scene_map]).items()
-        }
-        return {name: item for name, item in known.items() if name in own and not item.seconds} | of_map
+        """Return the readout times that are stated, of the map or from matches, by camera name."""
+        of_map, out = readouts_of_maps([self.scene_map]), {}
+        for name in self.scene_map.cameras:
+            camera, matched = self.cameras[name], self.from_matches.get(name)
+            if camera.rolling_shutter_known:
+                stated = stated_readout(camera.rolling_shutter_s)
+                out[name] = replace(stated, sideways=camera.camera.sideways)
+            elif name in of_map:
+                out[name] = of_map[name]
+            elif matched is not None and matched.determined:
+                out[name] = matched
+        return out
 
     def _with_velocities(
         self, rolling: RollingShutterModel, readouts: Mapping[str, Readout]
     ) -> _Refined | None:
         """Return the model after an adjustment with velocities and readout times; None if none is of use."""
         readout_s = _seconds(readouts)
-        built_for_shutters = readout_s.keys() <= self.scene_map.readout_s.keys()
         largest = min(_MAX_KEYFRAMES, self.mapping.skeletal_above)
-        if not built_for_shutters or len(self.scene_map.keyframe_camera) > largest:
+        if len(self.scene_map.keyframe_camera) > largest or not is_on(Mechanism.JOINT_VELOCITIES):
             return None
-        if not is_on(Mechanism.JOINT_VELOCITIES):
-            return None
-        model = rolling.with_exact_rates(readout_s, readout_s.keys()).corrected(readout_s)
+        model = rolling.with_exact_rates(readout_s, self.scene_map.readout_s.keys()).corrected(readout_s)
         removed = remove_dominant_points(model)
         adjusted = rolling.adjust_with_velocities(model, readouts, self.from_matches, self.equal_cameras)
         if adjusted is None:
@@ -274,6 +235,10 @@ class _Refinement:
         adjust_robustly(model, self.mapping.mapper_options(), self.mapping.calibrated_ids)
         refined = self._finished(rolling, model, adjusted.readouts, removed)
         return replace(refined, error_scales=adjusted.error_scales)
+
+    def _unchanged(self, rolling: RollingShutterModel, readouts: dict[str, Readout]) -> _Refined:
+        """Return the model as it is: no rolling shutter is found."""
+        return _Refined(rolling=rolling, model=self.model, readouts=readouts, corrected_px=None, removed=0)
 
     @staticmethod
     def _finished(
@@ -299,23 +264,6 @@ def _readout_of(entry: Mapping[str, Any]) -> Readout:
 def _seconds(readouts: Mapping[str, Readout]) -> dict[str, float]:
     """Return the readout times (seconds) of the cameras with a rolling shutter, by camera name."""
     return {name: readout.seconds for name, readout in readouts.items() if readout.seconds}
-
-
-def distorted_cameras(
-    rolling: RollingShutterModel, readout_s: Mapping[str, float], corrected: Collection[str]
-) -> set[str]:
-    """Return the names of the cameras for which a map should be built again from corrected keypoints.
-
-    Args:
-        rolling: The model.
-        readout_s: Readout time (seconds) of each camera with a rolling shutter, by camera name.
-        corrected: Names of the cameras whose keypoints were corrected before the model was built.
-    """
-    return {
-        name
-        for name in readout_s.keys() - set(corrected)
-        if rolling.displacement_px(name, readout_s[name]) > MAX_DISPLACEMENT_PX
-    }
 
 
 def _rotations(

@@ -11,21 +11,20 @@ _KEYS = {
     "flipped_cameras": "mirrored_cameras",
     "contradicting_cameras": "contradicting_cameras",
     "recalibrated": "freed_lenses",
-    "unknown_shutters": "unknown_shutters",
+    "uncorrected_shutters": "uncorrected_shutters",
     "excluded_from_pair": "named_initial_pair",
     "misfit_factors": "misfitting_lenses",
     "refined_intrinsics": "found_lenses",
     "extensions": "growth",
     "reach": "reach",
     "misplaced": "misplaced_keyframes",
-    "distorted_cameras": "distorted_cameras",
 }
 """Key in the log of each field, in the order in which they are written."""
 _LEFT_OUT = "left_out"
 """Key of the names in the entry of `excluded_from_pair`."""
 _CHECKED = ("misfit_factors", "reach")
 """Fields that are None without a check, and empty if the check found nothing."""
-_REFINED = ("misplaced", "distorted_cameras")
+_REFINED = ("misplaced",)
 """Fields whose entry an earlier refinement may have written. It is replaced by an empty one."""
 
 CameraGroups = tuple[tuple[str, ...], tuple[str, ...]]
@@ -67,10 +66,8 @@ class MapDiagnostics:
             as entries of the log. None if the distances were not checked.
         misplaced: By camera name, the frame indices of the keyframes that contradicted the map. They are not
             in the map.
-        unknown_shutters: Names of the cameras whose readout time neither the job nor the matches of adjacent
-            frames determine.
-        distorted_cameras: Names of the cameras whose rolling shutter displaces keypoints so far that the map
-            should be built again from corrected keypoints.
+        uncorrected_shutters: Names of the cameras that may have a rolling shutter for which no keypoint was
+            corrected before the map was built.
         details: All entries of the log in the order of the log, including the entries of the other fields.
     """
 
@@ -84,8 +81,7 @@ class MapDiagnostics:
     extensions: tuple[Mapping[str, Any], ...] = ()
     reach: Mapping[str, Any] | None = None
     misplaced: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    unknown_shutters: tuple[str, ...] = ()
-    distorted_cameras: tuple[str, ...] = ()
+    uncorrected_shutters: tuple[str, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod

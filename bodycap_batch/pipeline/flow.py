@@ -63,8 +63,6 @@ from bodycap_batch.tasks.sound import SOUND, SoundTask, known_from_sound
 from bodycap_batch.tasks.stage import Stage, read_summary
 from bodycap_batch.tasks.undistort import UNDISTORT, UndistortTask
 
-_REFINEMENTS = 2
-"""Maximum number of passes of the correction of rolling shutters. Evidence: docs/decisions/mapping.md."""
 _MAX_RECOVERY_THREADS = 2
 """Maximum number of threads of the recovery of one camera. The cameras lose different numbers of frames, so
 one task often runs alone at the end. Much of its work holds the interpreter's lock. Evidence:
@@ -172,7 +170,19 @@ class Flow:
         Raises:
             EstimationError: There is no map.
         """
-        artefact = self._build(keyframes)
+        task = MapTask(
+            options=self._job.map,
+            capture=self._footage(),
+            keyframes=refs_by_camera(keyframes),
+            may_be_empty=self._may_be_rotations,
+        )
+        body: list[Stage[Any]] = [MERGE, FILL] if has_body(self._job) else []
+        later: list[Stage[Any]] = [REGISTRATION, CLOCKS, LINKS, *body, EXPORT, REPORT]
+        # Features and matches keep all cores busy. After them, mapping keeps one core busy. Only then does
+        # another core load the libraries of later stages. Evidence: docs/decisions/pipeline.md.
+        modules = [module for stage in later for module in stage.modules]
+        preload = self._preload([modules], [REGISTRATION, CLOCKS, *body[:1]], step=RECONSTRUCTION)
+        artefact = self.runner.run(make_task(MAP, task, threads=self._threads), preload)
         if (failure := read_summary(artefact.path)["failure"]) is not None:
             self._map_failure = EstimationError(failure["message"], hint=failure["hint"])
             if self._settings.until == "map":
@@ -181,25 +191,6 @@ class Flow:
             self._sound.result()  # The sound is compared in much less time, so this does not wait.
         self.runner.report_notes(artefact, "map")
         return artefact
-
-    def _build(self, keyframes: ByCamera, refined: Artefact | None = None) -> Artefact:
-        """Build a map; `refined` is an earlier map in which rolling shutters were found."""
-        task = MapTask(
-            options=self._job.map,
-            capture=self._footage(),
-            keyframes=refs_by_camera(keyframes),
-            refined=optional_ref(refined),
-            may_be_empty=self._may_be_rotations and refined is None,
-        )
-        body: list[Stage[Any]] = [MERGE, FILL] if has_body(self._job) else []
-        later: list[Stage[Any]] = [REGISTRATION, CLOCKS, LINKS, *body, EXPORT, REPORT]
-        # Features and matches keep all cores busy. After them, mapping keeps one core busy. Only then does
-        # another core load the libraries of later stages. Evidence: docs/decisions/pipeline.md.
-        modules = [module for stage in later for module in stage.modules]
-        preload = self._preload([modules], [REGISTRATION, CLOCKS, *body[:1]], step=RECONSTRUCTION)
-        return self.runner.run(
-            make_task(MAP, task, map_round=self._map_round, threads=self._threads), preload
-        )
 
     def _preload(
         self, modules: Sequence[Sequence[str]], next_stages: Sequence[Stage[Any]], step: str = ""
@@ -284,57 +275,22 @@ class Flow:
         """Remove the deformation of the map that rolling shutters cause, and solve all poses again.
 
         If no camera has a rolling shutter, the map and the registrations are returned unchanged. If readout
-        times are unknown, and the poses show no rolling shutter, the registrations are unchanged. If the map
-        was built from keypoints that were not corrected, the first pass starts from wrong poses. Then there
-        is a second pass. If the shutters displace keypoints far, the map is built again before it, from
-        corrected keypoints.
+        times are unknown, and the keyframes show no rolling shutter, the registrations are unchanged.
         """
-        rolling = any(read_summary(artefact.path)["rolling"] for artefact in registrations.values())
-        if not rolling or not is_on(Mechanism.REFINEMENT):
+        before = read_summary(scene_map.path)
+        if not before["rolling"] or not is_on(Mechanism.REFINEMENT):
             return scene_map, registrations
-        passes = _REFINEMENTS if is_on(Mechanism.SECOND_REFINEMENT) else 1
-        for number in range(passes):
-            task = RefineTask(
-                options=self._job.map,
-                capture=self._footage(),
-                map=artefact_ref(scene_map),
-                registrations=refs_by_camera(registrations),
-            )
-            scene_map = self.runner.run(make_task(REFINE, task, threads=self._threads))
-            summary = read_summary(scene_map.path)
-            if not summary["corrected"] and not summary["corrected_before"]:
-                break
-            self._map_round += 1
-            again = None
-            if summary["distorted"] and number + 1 < passes and is_on(Mechanism.REBUILT_MAP):
-                again = self._rebuilt(scene_map, registrations, keyframes)
-            if again is None:
-                again = scene_map, self.register(scene_map, keyframes, registrations)
-            scene_map, registrations = again
-            if not summary["late"]:
-                break
-        return scene_map, registrations
-
-    def _rebuilt(
-        self, refined: Artefact, registrations: ByCamera, keyframes: ByCamera
-    ) -> tuple[Artefact, ByCamera] | None:
-        """Build the map again from keypoints that are corrected for the shutters of a refined map.
-
-        Where a camera turns fast, the first map lacks right matches and has wrong ones.
-
-        Returns:
-            The map and the registrations against it; None if there is no such map, or if fewer frames are
-            localised than before.
-        """
-        try:
-            rebuilt = self._build(keyframes, refined)
-        except EstimationError as error:
-            cause = "no map could be built from keypoints that were corrected for the rolling shutters"
-            self.runner.note(f"{cause}, so the earlier map is kept: {error.message}", "map")
-            return None
-        again = self.register(rebuilt, keyframes, registrations)
-        rebuilt, again = self.extend_map(rebuilt, again, keyframes)
-        return (rebuilt, again) if _posed_frames(again) >= _posed_frames(registrations) else None
+        task = RefineTask(
+            options=self._job.map,
+            capture=self._footage(),
+            map=artefact_ref(scene_map),
+            registrations=refs_by_camera(registrations),
+        )
+        refined = self.runner.run(make_task(REFINE, task, threads=self._threads))
+        if not read_summary(refined.path)["corrected"] and not before["corrected"]:
+            return refined, registrations
+        self._map_round += 1
+        return refined, self.register(refined, keyframes, registrations)
 
     def recover(self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera) -> ByCamera:
         """Recover the lost frames of each camera that has enough lost frames and enough localised frames."""

@@ -14,7 +14,7 @@ from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, FileRef
 from bodycap_batch.tasks.loading import load_registration
 from bodycap_batch.tasks.registered_cameras import INERTIAL_CAMERA
 from bodycap_batch.tasks.registration import save_registration
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, read_summary
+from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
 
 if TYPE_CHECKING:
     from bodycap_batch.model.scene import Trajectory
@@ -85,7 +85,7 @@ def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None
         notes.append(f"{camera.name}: {turns.says()}")
     registration = replace(registration, trajectory=found.trajectory)
     camera = replace(camera, nominal_fps=read_dataclass(FrameTiming, before, "timing").nominal_fps)
-    save_registration(registration, camera, files, rolling=read_summary(before)["rolling"], notes=notes)
+    save_registration(registration, camera, files, notes=notes)
     write_dataclass(found.camera, files, INERTIAL_CAMERA)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,16 +27,12 @@ class MapTask:
         options: The stage's options.
         capture: The videos of all cameras.
         keyframes: The selected keyframes of each camera, by camera name.
-        refined: An earlier map of the same pictures, in which rolling shutters were found. The new map is
-            built from its features, with keypoints that are corrected for the shutters. None in the first
-            round.
         may_be_empty: Store an empty map if there is none, because rotations alone are a result, too.
     """
 
     options: MapOptions
     capture: CaptureRef
     keyframes: Mapping[str, ArtefactRef]
-    refined: ArtefactRef | None = None
     may_be_empty: bool = False
 
 
@@ -79,14 +75,12 @@ class RefineTask:
 def run_map(task: MapTask, context: StageContext, files: Path) -> None:
     """Build the map and store it."""
     from bodycap_batch.core.errors import NO_MOTION_HINT, EstimationError
-    from bodycap_batch.mapping import build_map, earlier_results, empty_map
+    from bodycap_batch.mapping import build_map, empty_map
 
     selections = [load_keyframes(artefact.path) for artefact in task.keyframes.values()]
     capture = load_capture(task.capture, task.keyframes, threads=context.threads)
-    refined = None if task.refined is None else load_map(task.refined.path)
-    earlier = earlier_results(capture, refined)
     try:
-        result = build_map(capture, selections, task.options, context, earlier=earlier)
+        result = build_map(capture, selections, task.options, context)
     except EstimationError as error:
         if not task.may_be_empty or error.hint == NO_MOTION_HINT:
             raise
@@ -117,40 +111,15 @@ def run_refine(task: RefineTask, context: StageContext, files: Path) -> None:
     previous = load_map(task.map.path)
     capture = load_capture(task.capture, threads=context.threads)
     result = refine_map(capture, previous, paths, task.options, context)
-    rolling, before = _rolling_cameras(result), _rolling_cameras(previous)
-    save_map(
-        result,
-        files,
-        late=sorted(rolling - before),
-        corrected=sorted(rolling),
-        corrected_before=sorted(before),
-        distorted=result.diagnostics.distorted_cameras,
-    )
+    save_map(result, files)
 
 
-def _rolling_cameras(result: MapResult) -> set[str]:
-    """Return the names of the cameras for whose rolling shutters a map is corrected."""
-    return {name for scene_map in result.maps for name in scene_map.readout_s}
-
-
-def save_map(
-    result: MapResult,
-    files: Path,
-    *,
-    late: Sequence[str] = (),
-    corrected: Sequence[str] = (),
-    corrected_before: Sequence[str] = (),
-    distorted: Sequence[str] = (),
-) -> None:
+def save_map(result: MapResult, files: Path) -> None:
     """Store a map with its workspace. Extending the map later needs the workspace.
 
     Args:
         result: The map.
         files: Folder of the artefact.
-        late: Names of the cameras whose rolling shutters are corrected for the first time.
-        corrected: Names of the cameras whose rolling shutters are corrected.
-        corrected_before: Names of the cameras whose rolling shutters were corrected in the map before it.
-        distorted: Names of the cameras for whose rolling shutters the map should be built again.
     """
     from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.mapping.intrinsics.intrinsics_check import misfit_note
@@ -162,14 +131,13 @@ def save_map(
     write_dataclass(dataclasses.replace(result, workspace=workspace), files, "map")
     largest = result.maps[0]
     diagnostics = result.diagnostics
+    corrected = sorted({name for scene_map in result.maps for name in scene_map.readout_s})
     write_summary(
         files,
         keyframes=len(largest.keyframe_camera),
         points=len(largest.points),
-        late=list(late),
-        corrected=list(corrected),
-        corrected_before=list(corrected_before),
-        distorted=list(distorted),
+        corrected=corrected,
+        rolling=bool(corrected or diagnostics.uncorrected_shutters),
         failure=result.log.get("failure"),
         further=len(result.log.get("further_maps", ())),
         notes=[

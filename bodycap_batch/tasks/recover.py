@@ -11,7 +11,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.registration import NOT_ROUNDS, save_registration
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, read_summary
+from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
 
 _MEMORY_MB = 900
 """Memory to reserve (MB) for a recovery task. Recovery holds a limited number of keyframes and frames in
@@ -64,7 +64,7 @@ def run_recover(task: RecoverTask, context: StageContext, files: Path) -> None:
         misplaced=scene.diagnostics.misplaced.get(task.cameras[0], ()),
     )
     registration = recover_lost_frames(load_registration(paths[0]), inputs, task.options, context)
-    save_registration(registration, capture.cameras[0], files, rolling=read_summary(paths[0])["rolling"])
+    save_registration(registration, capture.cameras[0], files)
 
 
 RECOVER = Stage(

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bodycap_batch.tasks.loading import load_registration
-from bodycap_batch.tasks.stage import read_summary, write_summary
+from bodycap_batch.tasks.stage import write_summary
 
 if TYPE_CHECKING:
     from bodycap_batch.core.arrays import FloatArray
@@ -43,7 +43,7 @@ def replace_registration(found: Registration, before: Path, files: Path, **summa
     for name, kind in kinds.items():
         if (before / f"{name}.json").exists():
             write_dataclass(read_dataclass(kind, before, name), files, name)
-    write_summary(files, **registration_summary(found), rolling=read_summary(before)["rolling"], **summary)
+    write_summary(files, **registration_summary(found), **summary)
 
 
 def registration_summary(found: Registration) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from bodycap_batch.tasks.typed_json import omitted_from_key
 
 if TYPE_CHECKING:
     from bodycap_batch.capture import CaptureCamera
-    from bodycap_batch.model.scene import MapResult, Registration
+    from bodycap_batch.model.scene import Registration
 
 NOT_ROUNDS = omitted_from_key("rounds")
 """Metadata of a dataclass field; it omits the option `rounds` from the artefact's key. It sets which rounds
@@ -55,30 +55,7 @@ def run_registration(task: RegistrationTask, context: StageContext, files: Path)
     maps = scene.maps
     found = register_frames(camera, maps, selection, task.options, context, previous)
     found = withdraw_contradicted_poses(found, maps, scene.diagnostics.misplaced.get(camera.name, ()))
-    save_registration(found, camera, files, rolling=may_have_rolling_shutter(found, camera, scene))
-
-
-def may_have_rolling_shutter(found: Registration, camera: CaptureCamera, scene: MapResult) -> bool:
-    """Return whether the map is corrected for the camera's shutter, or whether its readout time is unknown.
-
-    The residuals are a weak evidence against a rolling shutter, because the map absorbs most of the
-    displacements. They decide only if the matches of adjacent frames found none. Evidence:
-    docs/decisions/mapping.md.
-
-    Args:
-        found: Poses and observations of the camera.
-        camera: The camera.
-        scene: The map to which the poses refer.
-    """
-    from bodycap_batch.model.rolling_shutter import has_visible_rolling_shutter
-
-    if camera.rolling_shutter_known:
-        return bool(camera.rolling_shutter_s)
-    if camera.name in scene.diagnostics.unknown_shutters:
-        return True
-    if any(camera.name in item.readout_s for item in scene.maps):
-        return True
-    return has_visible_rolling_shutter(found, scene.maps, allow_sideways=camera.may_be_sideways)
+    save_registration(found, camera, files)
 
 
 def save_registration(
@@ -86,7 +63,6 @@ def save_registration(
     camera: CaptureCamera,
     files: Path,
     *,
-    rolling: bool,
     notes: Sequence[str] = (),
 ) -> None:
     """Store the poses of a camera, the timing of its frames and its camera model.
@@ -95,7 +71,6 @@ def save_registration(
         found: Poses and observations of the camera.
         camera: The camera.
         files: Folder of the artefact.
-        rolling: True if the camera has a rolling shutter.
         notes: Notes for the user.
     """
     from bodycap_batch.formats.dataclass_files import write_dataclass
@@ -105,7 +80,7 @@ def save_registration(
     timing = FrameTiming(nominal_fps=camera.nominal_fps, rolling_shutter_s=camera.rolling_shutter_s)
     write_dataclass(timing, files, "timing")
     write_dataclass(camera.camera, files, "camera")
-    write_summary(files, **registration_summary(found), rolling=rolling, notes=list(notes))
+    write_summary(files, **registration_summary(found), notes=list(notes))
 
 
 REGISTRATION = Stage(

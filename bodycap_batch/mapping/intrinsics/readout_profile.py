@@ -16,7 +16,6 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.core.mechanisms import Mechanism, is_on
 from bodycap_batch.mapping.intrinsics.readout_time import (
     Readout,
-    few_blocks_factor,
     groups_of_equal_cameras,
     judged_readout,
 )
@@ -301,7 +300,7 @@ def _standard_deviation(costs: Sequence[FloatArray], speeds: Sequence[FloatArray
     if len(blocks) < _MIN_BLOCKS or total[0] - 2.0 * total[1] + total[2] <= 0.0:
         return float("inf")
     without = np.array([_newton_step(total - block) for block in blocks])
-    few = few_blocks_factor(len(blocks))
+    few = _few_blocks_factor(len(blocks))
     variance = few**2 * (len(blocks) - 1) / len(blocks) * ((without - without.mean()) ** 2).sum()
     variance += 2.0 * _PARALLAX_COST_RATIO * total[1] / (total[0] - 2.0 * total[1] + total[2])
     every, speed = np.concatenate(list(costs), axis=1), np.concatenate(list(speeds))
@@ -327,3 +326,13 @@ def _half(costs: FloatArray) -> tuple[float, float]:
     without = np.array([_newton_step(total - part) for part in parts])
     sigma = np.sqrt((_MIN_BLOCKS - 1) / _MIN_BLOCKS * ((without - without.mean()) ** 2).sum())
     return _newton_step(total), float(sigma)
+
+
+def _few_blocks_factor(blocks: int) -> float:
+    """Return the factor of a standard deviation that was estimated from a few independent blocks.
+
+    Few blocks often have similar estimates by chance. The factor is that of a 95 % interval.
+    """
+    from scipy.special import ndtri, stdtrit  # scipy.stats takes a second to import.
+
+    return float(stdtrit(blocks - 1, 0.975) / ndtri(0.975))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +14,6 @@ from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
 from bodycap_batch.inertial import camera_rotation
 from bodycap_batch.mapping.intrinsics.readout_time import (
-    DISPLACED_PERCENT,
     Readout,
     groups_of_equal_cameras,
     judged_readout,
@@ -25,10 +24,12 @@ from bodycap_batch.model.optical_flow import pixel_scale
 from bodycap_batch.model.rotation_path import TurningShutter
 from bodycap_batch.model.scene import KeyframeSelection, Map
 
-MAX_DISPLACEMENT_PX = 4.0
-"""Maximum displacement of the keypoints of a camera by its rolling shutter in a map that was built without a
-correction, px of an image with a long side of 640 px. If it is larger, right matches contradict the geometry
-of their pairs. Origin: COLMAP's limit of the deviation of a match. Evidence: docs/decisions/mapping.md."""
+_MAX_DISPLACEMENT_PX = 4.0
+"""Maximum displacement of the keypoints of a camera by a rolling shutter that is not corrected, px of an
+image with a long side of 640 px. If it is larger, right matches contradict the geometry of their pairs.
+Origin: COLMAP's limit of the deviation of a match."""
+_DISPLACED_PERCENT = 95.0
+"""Percentile of the displacements of keypoints that is compared with a limit. Evidence: none."""
 _MIN_POSSIBLE_S = 0.0001
 """Smallest readout time with which an adjustment looks for a short one, seconds. It only makes the
 displacements proportional to something."""
@@ -50,19 +51,27 @@ def known_readouts(capture: Capture) -> dict[str, Readout]:
     }
 
 
-def unknown_shutters(
-    capture: Capture, selections: Sequence[KeyframeSelection], readouts: Mapping[str, Readout]
+def uncorrected_shutters(
+    capture: Capture, readouts: Mapping[str, Readout], corrected: Collection[str]
 ) -> tuple[str, ...]:
-    """Return the names of the cameras whose readout time is neither stated nor determined by matches.
+    """Return the names of the cameras that may have a rolling shutter for which no keypoint was corrected.
 
     Args:
-        capture: All cameras.
-        selections: Keyframes of the cameras that are asked for.
+        capture: The cameras of the map.
         readouts: Readout times from matches between adjacent frames, by camera name. A camera without such
             matches has none.
+        corrected: Names of the cameras whose keypoints were corrected.
     """
-    names = [item.camera for item in selections if not capture.camera(item.camera).rolling_shutter_known]
-    return tuple(name for name in names if name not in readouts or not readouts[name].determined)
+    out = []
+    for camera in capture.cameras:
+        name, found = camera.name, readouts.get(camera.name)
+        if camera.rolling_shutter_known:
+            may_roll = bool(camera.rolling_shutter_s)
+        else:
+            may_roll = found is None or not found.excludes_rolling
+        if may_roll and name not in corrected:
+            out.append(name)
+    return tuple(out)
 
 
 def with_gyroscopes(
@@ -156,7 +165,7 @@ def possible_readouts(
     fast = {
         name
         for name, shutter in shutters.items()
-        if grid_displacement_px(shutter, frames[name]) > MAX_DISPLACEMENT_PX
+        if grid_displacement_px(shutter, frames[name]) > _MAX_DISPLACEMENT_PX
     }
     groups = groups_of_equal_cameras(capture.cameras)
     return {
@@ -189,7 +198,7 @@ def grid_displacement_px(shutter: TurningShutter, frames: IntArray) -> float:
     grid = np.stack(np.meshgrid(inside * lens.width_px, inside * lens.height_px), axis=-1).reshape(-1, 2)
     px = np.tile(grid, (len(frames), 1))
     moved = np.linalg.norm(shutter.px_at_mid_row(np.repeat(frames, len(grid)), px) - px, axis=1)
-    return float(np.percentile(moved, DISPLACED_PERCENT)) / pixel_scale(lens.width_px, lens.height_px)
+    return float(np.percentile(moved, _DISPLACED_PERCENT)) / pixel_scale(lens.width_px, lens.height_px)
 
 
 def write_shutters(workspace: Path, shutters: Mapping[str, TurningShutter]) -> None:
