@@ -19,11 +19,11 @@ Json = Mapping[str, Any]
 ORDERS = "BODYCAP_FAKE_ORDERS"
 """Path of a JSON file: {"fail" | "crash" | "hang" | "fill": stage, "on": text in its videos,
 "wanted" | "localised" | "contradicted": [a value per round], "lost": {camera: frames},
- "unused": {camera: reason}, "rolling": true, "late": number of maps,
- "unknown_clocks": [cameras], "corrected" | "corrected_before" | "distorted": [cameras] in refined maps,
+ "unused": {camera: reason}, "rolling": true, "unknown_clocks": [cameras],
+ "corrected": [a list of cameras for the first map and for each refined map],
  "wrong": {"given" | "auto": frames that the video contradicts}, "tracks_show_lenses": true,
  "no_map": {"message", "hint"}, "unposed": true, "moves": true,
- "fail_rebuilt": true, "telemetry": [cameras], "stabilised": [cameras],
+ "telemetry": [cameras], "stabilised": [cameras],
  "real": [stages that are no stand-ins]}.
  "fail" may be a list of stages."""
 
@@ -70,8 +70,6 @@ def stage(name: str) -> Any:
                 time.sleep(0.05)
         if name in as_list(orders().get("fail")) and meant:
             raise EstimationError(f"{name} does not work out", hint="film more")
-        if name == "map" and arguments.get("refined") and orders().get("fail_rebuilt"):
-            raise EstimationError("no map from corrected keypoints", hint="film more")
         if name == "check" and any("unreadable" in text for text in videos(arguments["job"])):
             raise CaptureError("the file cannot be read as a video", hint="copy the video again")
         if orders().get("fill") == name:
@@ -130,7 +128,6 @@ def registered(options: Json, arguments: Json, files: Path) -> None:
     wanted = [*orders().get("wanted", []), *[[]] * 9][again]
     localised = [*orders().get("localised", []), *[10] * 9][again]
     camera = arguments["capture"]["config"]["cameras"][0]["name"]
-    rolling = bool(orders().get("rolling"))
     frames = localised + orders().get("lost", {}).get(camera, 0)
     values = {
         "round": again,
@@ -138,7 +135,6 @@ def registered(options: Json, arguments: Json, files: Path) -> None:
         "localised": localised,
         "contradicted": [*orders().get("contradicted", []), *[0] * 9][again],
         "frames": frames,
-        "rolling": rolling,
     }
     (files / "summary.json").write_text(json.dumps(values))
 
@@ -164,24 +160,21 @@ def placed(options: Json, arguments: Json, files: Path) -> None:
     (files / "summary.json").write_text(json.dumps(values))
 
 
-def refined(options: Json, arguments: Json, files: Path) -> None:
-    """The readout times are found late in the first `late` maps that are refined."""
-    before = Path(arguments["map"]["path"]) / "summary.json"
-    passes = json.loads(before.read_text()).get("passes", 0) + 1 if before.exists() else 1
-    late = ["torso"] if passes <= orders().get("late", 0) else []
-    corrected, distorted = orders().get("corrected", ["torso"]), orders().get("distorted", late)
-    (files / "summary.json").write_text(
-        json.dumps(
-            {
-                "notes": [],
-                "passes": passes,
-                "late": late,
-                "corrected": corrected,
-                "distorted": distorted,
-                "corrected_before": orders().get("corrected_before", []),
-            }
-        )
+def mapped(options: Json, arguments: Json, files: Path) -> None:
+    """The first map, an extended one, or a refined one."""
+    before = Path(arguments["map"]["path"]) / "summary.json" if "map" in arguments else None
+    passes = (
+        0 if before is None else json.loads(before.read_text())["passes"] + ("registrations" in arguments)
     )
+    corrected = [*orders().get("corrected", [["torso"], ["torso"]]), *[[]] * 3][passes]
+    values = {
+        "notes": ["a note"],
+        "passes": passes,
+        "rolling": bool(orders().get("rolling")),
+        "corrected": corrected,
+        "failure": orders().get("no_map"),
+    }
+    (files / "summary.json").write_text(json.dumps(values))
 
 
 def recovered(options: Json, arguments: Json, files: Path) -> None:
@@ -260,7 +253,9 @@ EXTRA = {
     "check": checked,
     "inertial": with_sensor,
     "registration": registered,
-    "refine": refined,
+    "map": mapped,
+    "extend": mapped,
+    "refine": mapped,
     "recover": recovered,
     "sound": heard,
     "further_maps": further_mapped,

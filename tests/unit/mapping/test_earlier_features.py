@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast
 
 import cv2
@@ -14,7 +13,6 @@ import pytest
 from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config import MapOptions
 from bodycap_batch.core.context import StageContext
-from bodycap_batch.mapping import earlier_results
 from bodycap_batch.mapping.matching.database import (
     DATABASE_NAME,
     read_detected_px,
@@ -110,16 +108,3 @@ def test_only_pictures_that_the_earlier_map_lacks_are_read(tmp_path: Path) -> No
     assert camera.read_frames == [2, 5]
     _workspace(tmp_path / "alone", FRAMES)
     assert _content(tmp_path / "second") == _content(tmp_path / "alone")
-
-
-def test_features_are_taken_from_a_map_of_the_same_pictures() -> None:
-    capture: Any = SimpleNamespace(cameras=[SimpleNamespace(name="torso"), SimpleNamespace(name="palm")])
-    scene = SimpleNamespace(readout_s={"palm": 0.02}, readout_sigma_s={"palm": 0.001}, cameras={})
-    refined: Any = SimpleNamespace(workspace=Path("refined"), maps=[scene])
-    nothing = earlier_results(capture, None)
-    assert (nothing.features, nothing.readouts) == ({}, {})
-    found = earlier_results(capture, refined)
-    assert found.features == {"torso": Path("refined"), "palm": Path("refined")}
-    assert {name: (each.seconds, each.sigma_s) for name, each in found.readouts.items()} == {
-        "palm": (0.02, 0.001)
-    }

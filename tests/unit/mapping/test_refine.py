@@ -38,7 +38,10 @@ def refinement(
     )
     cameras = {
         name: SimpleNamespace(
-            rolling_shutter_known=name in stated, rolling_shutter_s=stated.get(name, 0.0), name=name
+            rolling_shutter_known=name in stated,
+            rolling_shutter_s=stated.get(name, 0.0),
+            name=name,
+            camera=SimpleNamespace(sideways=False),
         )
         for name in names
     }
@@ -54,30 +57,25 @@ def refinement(
     )
 
 
-def test_readout_times_of_the_map_and_of_global_shutters_are_decided() -> None:
+def test_readout_times_of_the_map_and_of_matches_are_known() -> None:
     none = judged_readout(0.0001, 0.0003)
     refined = refinement({"palm": 0.01}, {}, {"head": none, "palm": judged_readout(0.012, 0.002)})
-    assert refined._readouts_are_decided()
-    assert refined._readouts() == {"head": none, "palm": Readout(0.01, 0.0004, "of the map", 0.01, True)}
+    assert refined._known_readouts() == {
+        "head": none,
+        "palm": Readout(0.01, 0.0004, "of the map", 0.01, True),
+    }
 
 
 def test_a_stated_readout_time_stays_stated() -> None:
-    refined = refinement({"head": 0.02, "palm": 0.01}, {"head": 0.02}, {})
-    assert refined._readouts_are_decided()
-    assert refined._readouts()["head"] == Readout(0.02, 0.0, "stated", 0.02)
-    assert refined._readouts()["palm"].source == "of the map"
+    known = refinement({"head": 0.02, "palm": 0.01}, {"head": 0.02}, {})._known_readouts()
+    assert known["head"] == Readout(0.02, 0.0, "stated", 0.02)
+    assert known["palm"].source == "of the map"
 
 
-def test_a_readout_time_that_the_map_was_not_built_for_is_not_decided() -> None:
-    assert not refinement({"palm": 0.01}, {"head": 0.02}, {})._readouts_are_decided()
-    assert not refinement({"palm": 0.01}, {}, {"head": judged_readout(0.02, 0.001)})._readouts_are_decided()
-
-
-def test_an_unknown_readout_time_is_not_decided() -> None:
+def test_a_readout_time_that_matches_do_not_determine_is_unknown() -> None:
     unknown = judged_readout(0.003, 0.0027)
-    assert not refinement({"palm": 0.01}, {}, {"head": unknown})._readouts_are_decided()
-    assert not refinement({"palm": 0.01}, {}, {})._readouts_are_decided()
-    assert not refinement({}, {}, {"head": judged_readout(0.0001, 0.0003)})._readouts_are_decided()
+    assert refinement({"palm": 0.01}, {}, {"head": unknown})._known_readouts().keys() == {"palm"}
+    assert refinement({"palm": 0.01}, {}, {})._known_readouts().keys() == {"palm"}
 
 
 def test_an_unknown_error_of_a_logged_readout_time_is_infinite() -> None:
@@ -97,7 +95,7 @@ def test_lenses_stay_if_their_refinement_would_lose_the_points(
 
     def run(self: _Refinement) -> Any:
         held.append(list(self.mapping.calibrated_ids))
-        rolling = SimpleNamespace(motions=lambda *_: {}, displacement_px=lambda *_: 0.0)
+        rolling = SimpleNamespace(motions=lambda *_: {})
         return SimpleNamespace(
             model=model(left if len(held) == 1 else 80),
             readouts={},

@@ -22,7 +22,7 @@ from bodycap_batch.mapping.intrinsics.shutters import (
     read_shutters,
     readouts_of_maps,
     turning_shutters,
-    unknown_shutters,
+    uncorrected_shutters,
     write_shutters,
 )
 from bodycap_batch.mapping.matching.database import (
@@ -190,16 +190,24 @@ def test_only_cameras_with_a_rolling_shutter_get_one() -> None:
     assert list(turning_shutters(capture, selections, readouts)) == ["head"]
 
 
-def test_a_shutter_is_unknown_if_neither_the_job_nor_matches_determine_it() -> None:
-    stated = {"head": True, "hips": False, "torso": False, "left_palm": False, "right_palm": False}
-    capture: Any = SimpleNamespace(camera=lambda name: SimpleNamespace(rolling_shutter_known=stated[name]))
-    selections: Any = [SimpleNamespace(camera=name) for name in stated]
+def test_a_shutter_that_may_roll_is_uncorrected_if_no_keypoint_was_moved() -> None:
+    stated_s = {"head": 0.0, "chest": 0.02}
+    names = ("head", "chest", "hips", "torso", "left_palm", "right_palm", "still")
+    cameras = [
+        SimpleNamespace(
+            name=name, rolling_shutter_known=name in stated_s, rolling_shutter_s=stated_s.get(name, 0.0)
+        )
+        for name in names
+    ]
+    capture: Any = SimpleNamespace(cameras=cameras)
     readouts = {
         "hips": judged_readout(0.0, 0.0005),
         "torso": judged_readout(0.01, 0.0005),
         "left_palm": judged_readout(0.003, 0.0027),
+        "still": judged_readout(0.01, 0.0005),
     }
-    assert unknown_shutters(capture, selections, readouts) == ("left_palm", "right_palm")
+    found = uncorrected_shutters(capture, readouts, {"torso"})
+    assert found == ("chest", "left_palm", "right_palm", "still")
 
 
 def test_a_camera_that_turns_fast_may_have_a_short_readout_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -270,28 +278,3 @@ def test_a_matcher_that_is_not_enabled_finds_nothing() -> None:
     matcher.add(0, make_coarse_image(_picture(0)))
     matcher.add(1, make_coarse_image(_picture(1)))
     assert matcher.matches() is None
-
-
-def _estimate(best_s: float, sigma_s: float) -> Readout:
-    return Readout(best_s, sigma_s, "estimated", best_s)
-
-
-def test_equal_cameras_that_agree_share_the_mean_of_their_readouts() -> None:
-    equal = [_estimate(0.0247, 0.0007), _estimate(0.0257, 0.0009), _estimate(0.0245, 0.0006)]
-    shared = [item.pooled(equal) for item in equal]
-    assert len({item.best_s for item in shared}) == 1
-    assert shared[0].best_s == pytest.approx(0.0248, abs=0.0003)
-    # The errors of the spline between poses are common to all cameras: 2.5 %.
-    assert shared[0].sigma_s > 0.0006
-
-
-def test_equal_cameras_that_contradict_each_other_keep_their_readouts() -> None:
-    equal = [_estimate(0.010, 0.0002), _estimate(0.020, 0.0002)]
-    assert [item.pooled(equal).best_s for item in equal] == [0.010, 0.020]
-    assert equal[0].pooled([]) == equal[0]
-
-
-def test_a_camera_whose_residuals_tell_nothing_takes_the_readout_of_equal_cameras() -> None:
-    lost = _estimate(0.029, 0.001).pooled([_estimate(0.0171, 0.0003), _estimate(0.0167, 0.0003)])
-    assert lost.best_s == pytest.approx(0.0169, abs=1e-5)
-    assert lost.sigma_s < 0.001

@@ -18,8 +18,7 @@ LOG = {
     "freed_lenses": ["torso"],
     "found_lenses": {"torso": {"model": "RADIAL", "params": [400.0, 320.0, 240.0, 0.1, 0.0]}},
     "growth": [{"new_keyframes": 2}],
-    "unknown_shutters": ["torso"],
-    "distorted_cameras": ["torso"],
+    "uncorrected_shutters": ["torso"],
 }
 
 
@@ -36,12 +35,13 @@ def test_the_fields_hold_what_the_log_holds() -> None:
     assert found.recalibrated == ("torso",)
     assert found.refined_intrinsics == {"torso": RefinedIntrinsics("RADIAL", (400.0, 320.0, 240.0, 0.1, 0.0))}
     assert found.reach == LOG["reach"]
-    assert found.unknown_shutters == found.distorted_cameras == ("torso",)
+    assert found.uncorrected_shutters == ("torso",)
     assert found.extensions == ({"new_keyframes": 2},)
 
 
-def test_cameras_that_an_earlier_refinement_found_distorted_are_removed() -> None:
-    assert replace(MapDiagnostics.from_log(LOG), distorted_cameras=()).to_log()["distorted_cameras"] == []
+def test_keyframes_that_an_earlier_refinement_found_misplaced_are_removed() -> None:
+    before = MapDiagnostics.from_log({**LOG, "misplaced_keyframes": {"torso": [3]}})
+    assert replace(before, misplaced={}).to_log()["misplaced_keyframes"] == {}
 
 
 def test_an_empty_log_has_no_findings() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -10,32 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bodycap_batch.config import MapOptions
 from bodycap_batch.core.arrays import FloatArray, IntArray
-from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.export.metrics import observation_errors
 from bodycap_batch.mapping.intrinsics.readout_time import (
     Readout,
     RollingShutterModel,
-    estimate_readouts,
     judged_readout,
     map_with_readouts,
     stated_readout,
 )
-from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
 from bodycap_batch.mapping.reconstruction.motion_adjustment import AdjustedReadout
-from bodycap_batch.mapping.refine import distorted_cameras
-from bodycap_batch.model import rolling_shutter
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp
-from bodycap_batch.model.rolling_shutter import (
-    estimate_residual_readout,
-    has_visible_rolling_shutter,
-    image_velocity,
-    px_at_mid_row,
-)
+from bodycap_batch.model.rolling_shutter import px_at_mid_row
 from bodycap_batch.model.rotation_path import RotationPath
-from bodycap_batch.model.scene import FrameStatus, Map, Registration, Trajectory
+from bodycap_batch.model.scene import FrameStatus, Map, Trajectory
 
 LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([400.0, 400.0, 320.0, 240.0]))
 FRAMES = 90
@@ -148,20 +136,9 @@ def rolling_model(film: Film, *, known: bool = False, stated_s: float = 0.0, pos
     return RollingShutterModel(the_map(film, range(1, FRAMES, 5)), paths, {"head": camera})
 
 
-def readouts_of(film: Film, camera: Any) -> tuple[Any, Any]:
-    """Return the model that `estimate_readouts` leaves, and the readout that it estimates for the camera."""
-    model = RollingShutterModel(
-        the_map(film, range(1, FRAMES, 5)), {"head": film.trajectory()}, {"head": camera}
-    )
-    model, reported = estimate_readouts(
-        model, {"head": camera}, make_mapper_options(MapOptions(), [1], 1.0), [1]
-    )
-    return model, reported["head"]
-
-
-def found(readout_s: float, *, known: bool = False, stated_s: float = 0.0) -> Any:
-    rolling = rolling_model(Film(readout_s), known=known, stated_s=stated_s)
-    return rolling.estimate(make_mapper_options(MapOptions(), [1], 1.0), [1])["head"]
+def found(readout_s: float) -> Readout:
+    """Return the readout time that is found if nothing is known of it."""
+    return dict(rolling_model(Film(readout_s)).find_unknown({}))["head"]
 
 
 @pytest.mark.parametrize("readout_s", [0.02, -0.012])
@@ -179,40 +156,28 @@ def test_a_global_shutter_is_left_alone() -> None:
     assert abs(readout.best_s) < 5 * readout.sigma_s
 
 
-def test_a_stated_readout_time_is_not_looked_for() -> None:
-    readout = found(0.02, known=True, stated_s=0.017)
-    assert (readout.seconds, readout.source) == (0.017, "stated")
+def test_a_known_readout_time_is_not_looked_for() -> None:
+    assert rolling_model(Film(0.02)).find_unknown({"head": stated_readout(0.017)}) == {}
 
 
-@pytest.mark.parametrize("sideways", [False, True])
+def test_a_readout_time_that_displaces_nothing_stays_unknown() -> None:
+    film = Film(0.02)
+    film.map_from_cam = np.repeat(film.map_from_cam[:1], FRAMES, axis=0)
+    readout = rolling_model(film).find_unknown({})["head"]
+    assert (readout.seconds, readout.determined) == (0.0, False)
+
+
 @pytest.mark.parametrize("readout_s", [0.02, -0.02, 0.0])
-def test_the_direction_of_a_turned_sensor_is_estimated(readout_s: float, sideways: bool) -> None:
-    film = Film(readout_s, sideways)
-    model, reported = readouts_of(film, camera_of(film, may_be_sideways=True))
+def test_a_turned_sensor_is_read_along_columns(readout_s: float) -> None:
+    film = Film(readout_s, sideways=True)
+    model = rolling_model(film).with_sideways({"head"})
+    reported = model.find_unknown({})["head"]
     assert reported.source == ("estimated" if readout_s else "none found")
     assert abs(reported.seconds - readout_s) <= 0.1 * abs(readout_s)
-    assert reported.sideways == (sideways and readout_s != 0.0)
+    assert reported.sideways
     # Moved pixels lie where the true poses see their points, but for noise and the velocities' curvature.
     assert misfit_px(model.corrected({"head": reported.seconds}), film) < 1.0
     assert readout_s == 0.0 or misfit_px(model.corrected({}), film) > 1.5
-
-
-def test_the_displacements_by_a_shutter_grow_with_its_readout_time() -> None:
-    rolling = rolling_model(Film(0.02))
-    once, twice = (rolling.displacement_px("head", readout_s) for readout_s in (0.01, 0.02))
-    # The hand turns by 2 rad/s at most, so an edge row of 480 rows moves by 400 px · 2/s · 10 ms.
-    assert 1.0 < once < 8.0
-    assert twice == pytest.approx(2.0 * once, rel=0.1)
-    assert rolling.displacement_px("head", 0.0) == rolling.displacement_px("no camera", 0.02) == 0.0
-
-
-def test_a_map_is_built_again_only_if_a_shutter_found_late_displaces_keypoints_far() -> None:
-    # In pictures of 640 px, the keypoints of the hand above move by 4 px between 10 and 40 ms.
-    rolling = rolling_model(Film(0.02))
-    assert rolling.displacement_px("head", 0.01) < 4.0 < rolling.displacement_px("head", 0.04)
-    assert distorted_cameras(rolling, {"head": 0.01}, ()) == set()
-    assert distorted_cameras(rolling, {"head": 0.04}, ()) == {"head"}
-    assert distorted_cameras(rolling, {"head": 0.04}, ("head",)) == set()
 
 
 def model_with_inexact_path(film: Film, sigma_rad: float = 0.002) -> Any:
@@ -301,26 +266,6 @@ def test_without_a_readout_time_keypoints_stay_where_they_are() -> None:
         assert all(one.xy == pytest.approx(other.xy, abs=1e-6) for one, other in pairs)
 
 
-def test_a_stated_readout_runs_the_way_the_video_is_turned() -> None:
-    film = Film(0.02, sideways=True)
-    _, reported = readouts_of(film, camera_of(film, known=True, stated_s=0.02, may_be_sideways=True))
-    assert (reported.seconds, reported.source, reported.sideways) == (0.02, "stated", True)
-
-
-def test_a_stated_readout_keeps_its_way_where_none_could_be_looked_for(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def fails(*_: Any) -> None:
-        raise EstimationError("no convergence")
-
-    monkeypatch.setattr(RollingShutterModel, "estimate", fails)
-    film = Film(0.02, sideways=True)
-    _, reported = readouts_of(film, camera_of(film, known=True, stated_s=0.02, may_be_sideways=True))
-    assert (reported.seconds, reported.sideways) == (0.02, True)
-    _, reported = readouts_of(film, camera_of(film, may_be_sideways=True))
-    assert (reported.seconds, reported.source) == (0.0, "not determined: no convergence")
-
-
 def test_velocities_are_not_fitted_to_a_map_that_has_absorbed_the_displacements() -> None:
     # Pixels, poses and points agree without a correction, as they do in a map of uncorrected keypoints.
     film = Film(0.0)
@@ -329,12 +274,6 @@ def test_velocities_are_not_fitted_to_a_map_that_has_absorbed_the_displacements(
     fitted = misfit_px(rolling.with_exact_rates(readout_s, {"head"}).corrected(readout_s), film)
     assert moved == pytest.approx(misfit_px(rolling.corrected(readout_s), film), rel=0.1)
     assert fitted < 0.8 * moved
-
-
-def test_a_sensor_that_was_not_turned_is_read_along_rows_alone() -> None:
-    film = Film(0.02, sideways=True)
-    _, reported = readouts_of(film, camera_of(film))
-    assert not reported.sideways
 
 
 def test_a_map_says_which_way_its_sensors_are_read() -> None:
@@ -363,7 +302,7 @@ def test_a_map_says_which_way_its_sensors_are_read() -> None:
 
 def test_a_camera_whose_frames_lie_in_another_map_is_left_alone() -> None:
     rolling = rolling_model(Film(0.02), posed=False)
-    assert rolling.most_dynamic_subset().estimate(make_mapper_options(MapOptions(), [1], 1.0), [1]) == {}
+    assert rolling.find_unknown({}) == {}
     before, after = the_map(Film(0.02), range(1, FRAMES, 5)), rolling.corrected({"head": 0.02})
     for image_id in before.reg_image_ids():
         pairs = zip(before.image(image_id).points2D, after.image(image_id).points2D, strict=True)
@@ -378,17 +317,9 @@ def test_a_camera_whose_frames_lie_in_another_map_is_corrected_by_its_rotation()
     rolling = RollingShutterModel(
         the_map(film, range(1, FRAMES, 5)), {}, {"head": camera_of(film)}, rotations={"head": rotation}
     )
-    assert rolling.estimate(make_mapper_options(MapOptions(), [1], 1.0), [1], {"head": 0.02}) == {}
     # What remains is the motion of the position: 2 m/s at a distance of 3 to 6 m.
     for model in (rolling, rolling.with_exact_rates({"head": 0.02}, ["head"])):
         assert misfit_px(model.corrected({"head": 0.02}), film) < 0.6 * misfit_px(model.corrected({}), film)
-
-
-def test_what_could_not_be_determined_says_why_and_keeps_what_was_stated() -> None:
-    unknown = rolling_model(Film(0.02)).undetermined("no convergence")["head"]
-    assert (unknown.seconds, unknown.source) == (0.0, "not determined: no convergence")
-    stated = rolling_model(Film(0.02), known=True, stated_s=0.017).undetermined("no convergence")["head"]
-    assert (stated.seconds, stated.source) == (0.017, "stated")
 
 
 def test_the_fastest_keyframes_are_looked_at() -> None:
@@ -398,7 +329,7 @@ def test_the_fastest_keyframes_are_looked_at() -> None:
         {"head": film.trajectory()},
         {"head": SimpleNamespace(rolling_shutter_known=False, rolling_shutter_s=0.0)},  # type: ignore[dict-item]
     )
-    part = rolling.most_dynamic_subset()._model
+    part = rolling._most_dynamic_part()._model
     frames = sorted(int(part.image(number).name[-7:]) for number in part.reg_image_ids())
     assert len(frames) == 24
     assert set(np.diff(frames)) == {2}, "one run of successive keyframes"
@@ -434,130 +365,17 @@ def test_pixels_move_to_where_they_are_at_the_middle_row() -> None:
     film = Film(0.02)
     frame = 40
     points, px = film.seen(frame)
-    velocity = image_velocity(
-        LENS,
-        film.map_from_cam,
-        film.trajectory().times_ns,
-        np.full(len(points), frame),
-        film.points[points],
+    before, there, after = (
+        seen_from(film.map_from_cam[frame + step], film.points[points]) for step in (-1, 0, 1)
     )
-    cam_from_map = invert(film.map_from_cam[frame])
-    there = LENS.project(film.points[points] @ cam_from_map[:3, :3].T + cam_from_map[:3, 3])
+    velocity = (after - before) / (2.0 * FRAME_S)
     moved = px_at_mid_row(LENS, px, velocity, 0.02)
-    before, after = (np.sqrt(((each - there) ** 2).sum(1).mean()) for each in (px, moved))
-    assert before > 2.0
-    assert after < 2.0 * NOISE_PX, "little but the pixels' own noise (√2 σ) is left"
+    displaced, left = (np.sqrt(((each - there) ** 2).sum(1).mean()) for each in (px, moved))
+    assert displaced > 2.0
+    assert left < 2.0 * NOISE_PX, "little but the pixels' own noise (√2 σ) is left"
 
 
-def test_velocity_is_not_taken_across_a_hole_in_the_video() -> None:
-    film = Film(0.0)
-    point = np.array([[0.0, 0.0, 5.0]])
-    kept = np.r_[0:30, 60:FRAMES]
-    times_ns = film.trajectory().times_ns
-    for frame, inwards in ((29, -1), (30, 1)):  # the last before a hole of a second and the first after it
-        beside = kept[frame] + np.array([0, inwards])
-        whole = image_velocity(LENS, film.map_from_cam, times_ns, beside, np.repeat(point, 2, axis=0))
-        holed = image_velocity(LENS, film.map_from_cam[kept], times_ns[kept], np.array([frame]), point)
-        # From one side: the speed half a frame further inwards.
-        assert np.linalg.norm(holed - whole.mean(axis=0)) < 0.02 * np.linalg.norm(whole[0])
-
-
-def test_velocity_is_zero_without_neighbours() -> None:
-    film = Film(0.0)
-    lonely = np.full_like(film.map_from_cam, np.nan)
-    lonely[40] = film.map_from_cam[40]
-    velocity = image_velocity(
-        LENS, lonely, film.trajectory().times_ns, np.full(3, 40), np.array([[0.0, 0.0, 5.0]] * 3)
-    )
-    assert (velocity == 0).all()
-
-
-@pytest.mark.parametrize("sideways", [False, True])
-@pytest.mark.parametrize(("readout_s", "shows"), [(0.02, True), (0.0, False)])
-def test_a_rolling_shutter_shows_in_the_residuals(readout_s: float, shows: bool, sideways: bool) -> None:
-    film = Film(readout_s, sideways)
-    frames, pixels, residuals, seen = [], [], [], []
-    for frame in range(5, 60, 3):
-        points, px = film.seen(frame)
-        cam_from_map = invert(film.map_from_cam[frame])
-        projected = LENS.project(film.points[points] @ cam_from_map[:3, :3].T + cam_from_map[:3, 3])
-        frames.append(np.full(len(points), frame))
-        pixels.append(px)
-        residuals.append(px - projected)
-        seen.append(film.points[points])
-    frame_of, points_of = np.concatenate(frames), np.concatenate(seen)
-    velocity = image_velocity(LENS, film.map_from_cam, film.trajectory().times_ns, frame_of, points_of)
-    apparent_s, sigma_s = estimate_residual_readout(
-        replace(LENS, sideways=sideways),
-        frame_of,
-        np.concatenate(pixels),
-        np.concatenate(residuals),
-        velocity,
-    )
-    assert (abs(apparent_s) > 8 * sigma_s) is shows
-    assert not shows or 0.001 < apparent_s < 0.021
-
-
-def test_no_observations_tell_no_readout() -> None:
-    none = np.zeros((0, 2))
-    assert estimate_residual_readout(LENS, np.zeros(0, np.int64), none, none, none) == (0.0, float("inf"))
-
-
-@pytest.mark.parametrize(
-    ("film", "either_way", "shows"),
-    [
-        (Film(0.02), False, True),
-        (Film(0.02), True, True),
-        (Film(0.02, sideways=True), True, True),
-        (Film(0.0), True, False),
-    ],
-)
-def test_a_turned_sensor_is_looked_at_both_ways(film: Film, either_way: bool, shows: bool) -> None:
-    assert has_visible_rolling_shutter(*tracked(film), allow_sideways=either_way) is shows
-
-
-def tracked(film: Film) -> tuple[Registration, list[Map]]:
-    """Tracks of a keyframe's points through the film, and the map they are in."""
-    count = len(film.points)
-    scene = Map(
-        gauge="a",
-        cameras={"head": LENS},
-        keyframe_camera=("head",),
-        keyframe_frame=np.zeros(1, np.int64),
-        map_from_cam=film.map_from_cam[:1],
-        points=film.points,
-        colors=np.zeros((count, 3), np.uint8),
-        point_error_px=np.zeros(count),
-        obs_keyframe=np.zeros(count, np.int64),
-        obs_point=np.arange(count),
-        obs_feature=np.arange(count),
-        obs_px=np.zeros((count, 2)),
-    )
-    seen = {frame: film.seen(frame) for frame in range(5, 60, 3)}
-    found = Registration(
-        trajectory=film.trajectory(),
-        obs_frame=np.concatenate([np.full(len(points), frame) for frame, (points, _) in seen.items()]),
-        obs_keyframe=np.zeros(sum(len(points) for points, _ in seen.values()), np.int64),
-        obs_feature=np.concatenate([points for points, _ in seen.values()]),
-        obs_px=np.concatenate([px for _, px in seen.values()]).astype(np.float32),
-        wanted_keyframes=np.zeros(0, np.int64),
-        tried_keyframes=np.zeros(0, np.int64),
-    )
-    return found, [scene]
-
-
-def test_velocities_of_a_long_video_are_found_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(0)
-    count = 200_000
-    times_s = np.arange(FRAMES) * FRAME_S
-    frame = np.sort(rng.integers(FRAMES, size=count))
-    points = rng.uniform((-1.0, -1.0, 3.0), (1.0, 1.0, 5.0), (count, 3))
-    poses, times_ns = poses_at(times_s), np.round(times_s * 1e9).astype(np.int64)
-    tracemalloc.start()
-    found = image_velocity(LENS, poses, times_ns, frame, points)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    # Beside the velocities: a part's poses (128 bytes an observation) and what is made of them.
-    assert found.nbytes <= peak < found.nbytes + 4 * 128 * rolling_shutter._BATCH_ROWS
-    monkeypatch.setattr(rolling_shutter, "_BATCH_ROWS", count)
-    assert np.array_equal(image_velocity(LENS, poses, times_ns, frame, points), found)
+def seen_from(map_from_cam: FloatArray, points: FloatArray) -> FloatArray:
+    """Return the pixels (N,2) of points (N,3) from a pose."""
+    cam_from_map = invert(map_from_cam)
+    return LENS.project(points @ cam_from_map[:3, :3].T + cam_from_map[:3, 3])

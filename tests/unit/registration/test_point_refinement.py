@@ -9,7 +9,7 @@ import pytest
 
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import invert, make_transform, so3_exp, transform_points
-from bodycap_batch.model.rolling_shutter import image_velocity, px_at_mid_row
+from bodycap_batch.model.rolling_shutter import px_at_mid_row
 from bodycap_batch.model.scene import FrameStatus, Map, Trajectory
 from bodycap_batch.registration.recovery import point_refinement
 from bodycap_batch.registration.recovery.point_refinement import refine_points, remove_weak_boundary_poses
@@ -91,9 +91,7 @@ def _map(path: Trajectory, *, readout_s: float = 0.0) -> Map:
         seen_px = LENS.project(transform_points(invert(poses[row]), points))
         inside = np.flatnonzero(((seen_px > 0) & (seen_px < (640, 480))).all(axis=1))
         inside = inside[rng.random(len(inside)) < 0.3]
-        velocity = image_velocity(
-            LENS, truth.gauge_from_cam, truth.times_ns, np.full(len(inside), frame), points[inside]
-        )
+        velocity = _velocity_px_s(truth, frame, points[inside])
         rows.append(np.full(len(inside), row))
         point.append(inside)
         px.append(px_at_mid_row(LENS, seen_px[inside], velocity, -readout_s))
@@ -118,6 +116,15 @@ def _map(path: Trajectory, *, readout_s: float = 0.0) -> Map:
         obs_px=seen_px,
         readout_s={"torso": readout_s} if readout_s else {},
     )
+
+
+def _velocity_px_s(path: Trajectory, frame: int, points: np.ndarray) -> np.ndarray:
+    """Image velocities (N,2) of points, from the frames before and after a frame, as far as they exist."""
+    first, last = max(frame - 1, 0), min(frame + 1, len(path.times_ns) - 1)
+    earlier, later = (
+        LENS.project(transform_points(invert(path.gauge_from_cam[at]), points)) for at in (first, last)
+    )
+    return np.asarray((later - earlier) / (1e-9 * (path.times_ns[last] - path.times_ns[first])))
 
 
 def _off_m(scene: Map) -> np.ndarray:

@@ -84,7 +84,7 @@ def _run(
     before, after = tmp_path / "before", tmp_path / "after"
     before.mkdir()
     after.mkdir()
-    save_registration(registration, open_capture(spec).cameras[0], before, rolling=False)
+    save_registration(registration, open_capture(spec).cameras[0], before)
     task = InertialTask(
         options=TelemetryOptions(),
         cameras=("left_palm",),

@@ -31,7 +31,6 @@ from bodycap_batch.pipeline.inputs import body_input, camera_digest
 from bodycap_batch.store.digests import FileDigests
 from bodycap_batch.tasks.body import mount_prior
 from bodycap_batch.tasks.export import log_of
-from bodycap_batch.tasks.registration import may_have_rolling_shutter
 from bodycap_batch.tasks.rotations import lens_for_rotations, without_positions
 from tests.scenes import small_map
 
@@ -172,20 +171,6 @@ def test_a_disk_that_fails_while_footage_is_read_is_reported_instead_of_the_file
     with pytest.raises(DiskAway, match=os.strerror(number)) as caught:
         camera_digest(job.capture, job.capture.cameras[0], FileDigests(tmp_path / "digests"))
     assert caught.value.path == str(job.capture.cameras[0].video[0])
-
-
-def test_a_map_is_corrected_again_if_matches_do_not_determine_a_readout(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    # The poses show no rolling shutter: the map has absorbed most of its displacements.
-    monkeypatch.setattr(
-        "bodycap_batch.model.rolling_shutter.has_visible_rolling_shutter", lambda *_, **__: False
-    )
-    camera: Any = SimpleNamespace(name="torso", rolling_shutter_known=False, may_be_sideways=False)
-    for names, expected in (((), False), (("torso",), True), (("palm",), False)):
-        log = MapDiagnostics(unknown_shutters=names).to_log()
-        scene: Any = SimpleNamespace(maps=(), diagnostics=MapDiagnostics.from_log(log))
-        assert may_have_rolling_shutter(SimpleNamespace(), camera, scene) is expected  # type: ignore[arg-type]
 
 
 def test_positions_that_say_nothing_are_found_by_the_links_and_the_sigma() -> None:
