@@ -40,7 +40,7 @@ SUBLAYERS: dict[str, Sequence[set[str]]] = {
         {"intrinsics", "mapping_context"},
         {"re_registration"},
         {"validation", "initial_models"},
-        {"inputs", "model_joining"},
+        {"inputs"},
         {"results"},
         {"build", "empty_map", "extend", "further_maps", "refine"},
     ),

@@ -45,7 +45,6 @@ from bodycap_batch.mapping.matching.flipped_cameras import add_flip_hint, exclud
 from bodycap_batch.mapping.matching.keyframe_features import CameraKeyframes, add_keyframes
 from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_keyframes
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
-from bodycap_batch.mapping.model_joining import join_models
 from bodycap_batch.mapping.reconstruction.mapper_options import MIN_RESECTION_INLIERS
 from bodycap_batch.mapping.reconstruction.model_files import write_models
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
@@ -189,7 +188,6 @@ def build_map_once(
     models, initial_log = reconstruct_with_intrinsics(mapping, options, uncalibrated, len(skeletal.refs))
     log: dict[str, Any] = {"keyframes": len(refs), **match_log, **initial_log, **flips.to_log()}
     if models:
-        models, log["joined"] = join_models(models, mapping)
         models[0], log["repair"] = repair_model(models[0], tried, mapping, skeletal.refs)
         resected: Sequence[set[int] | None] = [None] * len(models)
         if skeletal is not generator:

@@ -651,7 +651,7 @@ def test_places_that_the_motion_does_not_show_are_asked_for(bench: Bench) -> Non
 def test_a_mechanism_that_is_switched_off_is_part_of_every_key(
     done: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("BODYCAP_WITHOUT", "join_models")
+    monkeypatch.setenv("BODYCAP_WITHOUT", "skeletal_set")
     assert done.executed() == ALL
     monkeypatch.delenv("BODYCAP_WITHOUT")
     assert done.executed() == []

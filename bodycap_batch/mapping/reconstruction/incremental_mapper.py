@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -152,24 +151,6 @@ def resect_images(
     model.update_point_3d_errors()
     mapper.end_reconstruction(False)
     return registered
-
-
-@contextmanager
-def opened_mapper(
-    workspace: Path, settings: pycolmap.IncrementalPipelineOptions, model: pycolmap.Reconstruction
-) -> Iterator[pycolmap.IncrementalMapper]:
-    """Give a COLMAP mapper for a model. While it is open, the model contains all images of the database.
-
-    Args:
-        workspace: Folder of the database.
-        settings: The mapper's options.
-        model: A reconstruction. Images that are not registered at the end are removed from it.
-    """
-    mapper = _open_mapper(workspace, settings)
-    mapper.begin_reconstruction(model)
-    yield mapper
-    model.update_point_3d_errors()
-    mapper.end_reconstruction(False)
 
 
 def _open_mapper(

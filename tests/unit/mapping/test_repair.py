@@ -27,12 +27,10 @@ from bodycap_batch.mapping.matching.database import (
     read_image_ids,
 )
 from bodycap_batch.mapping.matching.pair_matching import find_mutual_matches, match_pairs
-from bodycap_batch.mapping.model_joining import common_similarity, join_models
 from bodycap_batch.mapping.re_registration import re_register_images
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import (
     adjust_and_filter,
     adjust_robustly,
-    sub_model,
 )
 from bodycap_batch.mapping.reconstruction.incremental_mapper import _MapperRun, register_images
 from bodycap_batch.mapping.reconstruction.initial_pair import find_user_pair, rank_initial_pairs
@@ -417,58 +415,6 @@ def test_keyframes_are_registered_again_against_the_rest(
     placed = re_register_images(wrong, {ids[frame] for frame in _MOVED}, mapping, KEYFRAMES)
     assert placed.num_reg_images() == KEYFRAMES
     assert _rms(placed, poses) < 0.01
-
-
-def _two_models(
-    built: tuple[Any, FloatArray, MappingContext, set[Any]], first: range, second: range
-) -> tuple[Any, Any]:
-    """Return two models of some frames each, the second one in another gauge."""
-    model, _, mapping, _ = built
-    ids = {ref.frame: number for ref, number in _ids(mapping).items()}
-    parts = [sub_model(model, {ids[frame] for frame in frames}) for frames in (first, second)]
-    turn = pycolmap.Rotation3d(so3_exp(np.array([0.3, -0.5, 1.0])))
-    parts[1].transform(pycolmap.Sim3d(0.3, turn, np.array([1.0, -2.0, 0.5])))
-    return parts[0], parts[1]
-
-
-@pytest.mark.parametrize("is_large", [False, True])
-def test_models_with_common_keyframes_become_one(
-    built: tuple[Any, FloatArray, MappingContext, set[Any]], is_large: bool
-) -> None:
-    model, poses, mapping, _ = built
-    mapping = replace(mapping, skeletal_above=1 if is_large else 100)
-    main, further = _two_models(built, range(10), range(7, KEYFRAMES))
-    models, log = join_models([main, further], mapping)
-    assert [each.num_reg_images() for each in models] == [KEYFRAMES]
-    assert log[0]["joined"] == KEYFRAMES
-    assert main.num_reg_images() == 10
-    # The joined model has the same observations as the model of all keyframes.
-    assert _rms(models[0], poses) < 1.5 * _rms(model, poses)
-    assert models[0].num_points3D() > 0.9 * model.num_points3D()
-
-
-def test_models_with_too_few_common_keyframes_stay_apart(
-    built: tuple[Any, FloatArray, MappingContext, set[Any]],
-) -> None:
-    main, further = _two_models(built, range(10), range(8, KEYFRAMES))
-    models, log = join_models([main, further], built[2])
-    assert models == [main, further]
-    assert log == []
-
-
-def test_models_are_not_joined_by_misplaced_keyframes(
-    built: tuple[Any, FloatArray, MappingContext, set[Any]],
-) -> None:
-    mapping = built[2]
-    main, further = _two_models(built, range(10), range(6, KEYFRAMES))
-    ids = {ref.frame: number for ref, number in _ids(mapping).items()}
-    block = {ids[frame] for frame in range(6, 10)}
-    # The common keyframes agree with one similarity, but it is not that of the other keyframes.
-    wrong = misplace(further, block, Similarity(2.5, np.eye(3), np.array([0.3, 0.0, 0.1])))
-    assert common_similarity(main, wrong, 8.0) is not None
-    models, log = join_models([main, wrong], mapping)
-    assert models == [main, wrong]
-    assert log[0]["failed"] == "the joined model contradicts its matches"
 
 
 def test_progress_counts_the_keyframes_that_the_map_has_already(
