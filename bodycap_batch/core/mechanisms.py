@@ -35,7 +35,6 @@ class Mechanism(StrEnum):
     RECALIBRATION = "recalibration"
     READOUT_PROFILE = "readout_profile"
     REFINEMENT = "refinement"
-    SECOND_REFINEMENT = "second_refinement"
     JOINT_VELOCITIES = "joint_velocities"
     EQUAL_CAMERAS = "equal_cameras"
     MISPLACED_KEYFRAMES = "misplaced_keyframes"

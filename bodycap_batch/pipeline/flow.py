@@ -63,8 +63,6 @@ from bodycap_batch.tasks.sound import SOUND, SoundTask, known_from_sound
 from bodycap_batch.tasks.stage import Stage, read_summary
 from bodycap_batch.tasks.undistort import UNDISTORT, UndistortTask
 
-_REFINEMENTS = 2
-"""Maximum number of passes of the correction of rolling shutters. Evidence: docs/decisions/mapping.md."""
 _MAX_RECOVERY_THREADS = 2
 """Maximum number of threads of the recovery of one camera. The cameras lose different numbers of frames, so
 one task often runs alone at the end. Much of its work holds the interpreter's lock. Evidence:
@@ -277,28 +275,22 @@ class Flow:
         """Remove the deformation of the map that rolling shutters cause, and solve all poses again.
 
         If no camera has a rolling shutter, the map and the registrations are returned unchanged. If readout
-        times are unknown, and the keyframes show no rolling shutter, the registrations are unchanged. If a
-        shutter was unknown before, the poses of the frames were wrong. Then there is a second pass.
+        times are unknown, and the keyframes show no rolling shutter, the registrations are unchanged.
         """
-        for _ in range(_REFINEMENTS if is_on(Mechanism.SECOND_REFINEMENT) else 1):
-            before = read_summary(scene_map.path)
-            if not before["rolling"] or not is_on(Mechanism.REFINEMENT):
-                break
-            task = RefineTask(
-                options=self._job.map,
-                capture=self._footage(),
-                map=artefact_ref(scene_map),
-                registrations=refs_by_camera(registrations),
-            )
-            scene_map = self.runner.run(make_task(REFINE, task, threads=self._threads))
-            corrected = set(read_summary(scene_map.path)["corrected"])
-            if not corrected and not before["corrected"]:
-                break
-            self._map_round += 1
-            registrations = self.register(scene_map, keyframes, registrations)
-            if corrected <= set(before["corrected"]):
-                break
-        return scene_map, registrations
+        before = read_summary(scene_map.path)
+        if not before["rolling"] or not is_on(Mechanism.REFINEMENT):
+            return scene_map, registrations
+        task = RefineTask(
+            options=self._job.map,
+            capture=self._footage(),
+            map=artefact_ref(scene_map),
+            registrations=refs_by_camera(registrations),
+        )
+        refined = self.runner.run(make_task(REFINE, task, threads=self._threads))
+        if not read_summary(refined.path)["corrected"] and not before["corrected"]:
+            return refined, registrations
+        self._map_round += 1
+        return refined, self.register(refined, keyframes, registrations)
 
     def recover(self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera) -> ByCamera:
         """Recover the lost frames of each camera that has enough lost frames and enough localised frames."""

@@ -482,14 +482,6 @@ def test_poses_that_were_solved_with_readouts_are_solved_again_without_them(benc
     assert (executed.count("refine"), executed.count("registration torso")) == (1, 2)
 
 
-def test_a_readout_that_was_unknown_before_is_followed_by_a_second_pass(bench: Bench) -> None:
-    bench.order(rolling=True, corrected=[[], ["torso"], ["torso"]])
-    executed = bench.executed()
-    assert executed.count("map") == 1
-    assert (executed.count("refine"), executed.count("registration torso")) == (2, 3)
-    assert bench.executed() == []
-
-
 def stopped_at_the_order(bench: Bench, meanwhile: Callable[[], None] = lambda: None) -> list[Cancelled]:
     """Run in a thread until a stage hangs, as ordered, then stop it; returns how the run ended."""
     failures: list[Cancelled] = []
