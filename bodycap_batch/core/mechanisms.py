@@ -56,6 +56,7 @@ class Mechanism(StrEnum):
     PURE_ROTATION = "pure_rotation"
     FREED_LENSES = "freed_lenses"
     CONTINUITY = "continuity"
+    PAIR_ROTATIONS = "pair_rotations"
     MOUNT_SLIPS = "mount_slips"
     LYING = "lying"
 

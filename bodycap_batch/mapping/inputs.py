@@ -66,8 +66,11 @@ def frame_times_ns(capture: Capture) -> dict[str, IntArray]:
 
 
 def intrinsics_of(capture: Capture) -> dict[str, CameraIntrinsics]:
-    """Return the intrinsics of each camera, by camera name."""
-    return {item.name: CameraIntrinsics(item.camera, item.calibrated) for item in capture.cameras}
+    """Return the intrinsics of each camera, and how it turns, by camera name."""
+    return {
+        item.name: CameraIntrinsics(item.camera, item.calibrated, item.rotation_chain, item.times_ns)
+        for item in capture.cameras
+    }
 
 
 def threshold_scale(capture: Capture) -> float:

@@ -111,7 +111,7 @@ class _Matches:
         matches = find_mutual_matches(
             one.descriptors.astype(np.float32), other.descriptors.astype(np.float32)
         )
-        return len(verify_pair(matches, one, other))
+        return len(verify_pair(matches, one, other).matches)
 
 
 def _size(features: dict[int, SiftFeatures], pair: Sequence[int]) -> int:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pair, read_image_ids
 from bodycap_batch.mapping.matching.descriptors import (
@@ -23,6 +24,7 @@ from bodycap_batch.mapping.matching.descriptors import (
     ByteDescriptors,
     FloatDescriptors,
 )
+from bodycap_batch.mapping.matching.rotation_graph import PairRotation, find_contradicted_pairs
 from bodycap_batch.model.camera import CV2_PIXEL_OFFSET_PX
 from bodycap_batch.model.optical_flow import pixel_scale
 
@@ -118,7 +120,8 @@ def match_pairs(
         context: Threads, progress, cancellation.
 
     Returns:
-        Number of verified matches of each verified pair.
+        Number of verified matches of each verified pair. Pairs that the rotation of the videos contradicts
+        are not verified (`find_contradicted_pairs`). Those of earlier calls are removed, too.
 
     Source: Lowe, IJCV 2004 (ratio test); Barath et al., "MAGSAC++", CVPR 2020 and Raguram et al., "USAC",
         PAMI 2013, as implemented in OpenCV, for the robust fit.
@@ -133,13 +136,37 @@ def match_pairs(
             context.progress(done, len(pairs), "pairs")
             block = pairs[done : done + _PAIRS_PER_TRANSACTION]
             with pycolmap.DatabaseTransaction(database):
-                for (a, b), matches in zip(block, _match_block(block, features, context), strict=True):
-                    if len(matches) >= MIN_INLIERS:
+                for (a, b), found in zip(block, _match_block(block, features, context), strict=True):
+                    if len(found.matches) >= MIN_INLIERS:
                         calibrated = features[a].calibrated and features[b].calibrated
-                        _write_matches(database, ids[a], ids[b], matches, calibrated=calibrated)
-                        verified[a, b] = len(matches)
-    context.progress(len(pairs), len(pairs), "pairs")
-    return verified
+                        _write_matches(database, ids[a], ids[b], found, calibrated=calibrated)
+                        verified[a, b] = len(found.matches)
+        context.progress(len(pairs), len(pairs), "pairs")
+        contradicted = _remove_contradicted(database, ids, intrinsics) if verified else set[Pair]()
+    return {pair: count for pair, count in verified.items() if pair not in contradicted}
+
+
+def _remove_contradicted(
+    database: pycolmap.Database, ids: Mapping[ImageRef, int], intrinsics: Mapping[str, CameraIntrinsics]
+) -> set[Pair]:
+    """Remove the verified pairs that the rotation of the videos contradicts, and return them."""
+    import pycolmap
+
+    if not is_on(Mechanism.PAIR_ROTATIONS):
+        return set()
+    ref_of = {number: ref for ref, number in ids.items()}
+    pairs = []
+    for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
+        first, second = (ref_of[number] for number in pycolmap.pair_id_to_image_pair(pair_id))
+        if geometry.cam2_from_cam1 is not None:
+            rotation = geometry.cam2_from_cam1.rotation.matrix()
+            pairs.append(PairRotation((first, second), rotation, len(geometry.inlier_matches)))
+    found = find_contradicted_pairs(pairs, intrinsics)
+    with pycolmap.DatabaseTransaction(database):
+        for first, second in sorted(found):
+            database.delete_two_view_geometry(ids[first], ids[second])
+    record_act(Mechanism.PAIR_ROTATIONS, len(found))
+    return found
 
 
 def _read_features(
@@ -161,16 +188,12 @@ def _read_features(
 
 def _match_block(
     pairs: Sequence[Pair], features: Mapping[ImageRef, KeyframeFeatures], context: StageContext
-) -> Iterator[IntArray]:
-    """Match and verify pairs in several threads.
-
-    Yields:
-        (M,2) verified matches of each pair, as indices of features, in the order of `pairs`.
-    """
+) -> Iterator[VerifiedMatches]:
+    """Match and verify pairs in several threads, and yield the verified matches in the order of `pairs`."""
     parts = [pairs[start :: context.threads] for start in range(context.threads)]
 
-    def work(part: Sequence[Pair]) -> list[IntArray]:
-        out, last, first = [], None, np.zeros((0, 128), np.float32)
+    def work(part: Sequence[Pair]) -> list[VerifiedMatches]:
+        out, last, first = list[VerifiedMatches](), None, np.zeros((0, 128), np.float32)
         for a, b in part:
             context.check_cancelled()
             if a != last:
@@ -217,14 +240,28 @@ def _angle_rad(products: npt.NDArray[np.float32]) -> FloatArray:
     return np.asarray(np.arccos(np.clip(products.astype(np.float64) / DESCRIPTOR_NORM**2, -1.0, 1.0)))
 
 
-def verify_pair(matches: IntArray, a: KeyframeFeatures, b: KeyframeFeatures) -> IntArray:
-    """Return the subset (M,2) of the matches that agrees with one two-view geometry.
+@dataclass(frozen=True, slots=True)
+class VerifiedMatches:
+    """The matches of a pair that agree with one two-view geometry.
+
+    Attributes:
+        matches: (M,2) indices of the features.
+        b_from_a: (3,4) rotation and direction of the translation from camera a to camera b; None if a camera
+            is not calibrated, or without matches.
+    """
+
+    matches: IntArray
+    b_from_a: FloatArray | None = None
+
+
+def verify_pair(matches: IntArray, a: KeyframeFeatures, b: KeyframeFeatures) -> VerifiedMatches:
+    """Return the subset of the matches (K,2) that agrees with one two-view geometry.
 
     The two-view geometry is an essential matrix if both cameras are calibrated, else a fundamental matrix.
     """
     import cv2
 
-    none = matches[:0]
+    none = VerifiedMatches(matches[:0])
     if a.calibrated and b.calibrated:
         rays = np.abs(np.column_stack([a.rays[matches[:, 0]], b.rays[matches[:, 1]]]))
         matches = matches[(rays < _MAX_TANGENT).all(axis=1)]  # The comparison is False for NaN.
@@ -236,13 +273,16 @@ def verify_pair(matches: IntArray, a: KeyframeFeatures, b: KeyframeFeatures) -> 
         if a.calibrated and b.calibrated:
             limit = 0.5 * (a.error + b.error)
             trials = max_trials(len(matches), _SAMPLE_CALIBRATED)
-            _, kept = cv2.findEssentialMat(first, second, np.eye(3), method, _CONFIDENCE, limit, trials)
+            essential, kept = cv2.findEssentialMat(
+                first, second, np.eye(3), method, _CONFIDENCE, limit, trials
+            )
         else:
             # If only one camera is calibrated, its rays are converted to undistorted pixels, because the
             # positions in the other keyframe are pixels too.
             first, second = first * (_error_px(a) / a.error), second * (_error_px(b) / b.error)
             limit = 0.5 * (_error_px(a) + _error_px(b))
             trials = max_trials(len(matches), _SAMPLE_UNCALIBRATED)
+            essential = None
             _, kept = cv2.findFundamentalMat(first, second, method, limit, _CONFIDENCE, trials)
     except cv2.error as error:
         # If no sample gives a two-view geometry, an assertion in OpenCV fails. Then no match is verified.
@@ -250,7 +290,13 @@ def verify_pair(matches: IntArray, a: KeyframeFeatures, b: KeyframeFeatures) -> 
         if error.code != _CV_ASSERTION_FAILED:
             raise
         return none
-    return none if kept is None else matches[kept.ravel().astype(bool)]
+    if kept is None:
+        return none
+    inside = kept.ravel().astype(bool)
+    if essential is None or essential.shape != (3, 3) or inside.sum() < MIN_INLIERS:
+        return VerifiedMatches(matches[inside])
+    _, rotation, direction, _ = cv2.recoverPose(essential, first[inside], second[inside], np.eye(3))
+    return VerifiedMatches(matches[inside], np.hstack([rotation, direction]))
 
 
 def max_trials(count: int, sample: int) -> int:
@@ -279,13 +325,15 @@ def _error_px(features: KeyframeFeatures) -> float:
 
 
 def _write_matches(
-    database: pycolmap.Database, a: int, b: int, matches: IntArray, *, calibrated: bool
+    database: pycolmap.Database, a: int, b: int, found: VerifiedMatches, *, calibrated: bool
 ) -> None:
-    """Write the verified matches (M,2) of the images `a` and `b` to the database."""
+    """Write the verified matches of the images `a` and `b` to the database."""
     import pycolmap
 
     configuration = pycolmap.TwoViewGeometryConfiguration
     geometry: Any = pycolmap.TwoViewGeometry()
     geometry.config = configuration.CALIBRATED if calibrated else configuration.UNCALIBRATED
-    geometry.inlier_matches = matches.astype(np.uint32)
+    if found.b_from_a is not None:
+        geometry.cam2_from_cam1 = pycolmap.Rigid3d(found.b_from_a)
+    geometry.inlier_matches = found.matches.astype(np.uint32)
     database.write_two_view_geometry(a, b, geometry)

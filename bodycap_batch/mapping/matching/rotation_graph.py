@@ -1,0 +1,225 @@
+"""Find pairs of keyframes that only look alike: the rotation of the videos contradicts their matches.
+
+Rooms repeat themselves: bays, windows, cabinets. Pairs that only look alike come in crowds, and they agree
+with each other, so neither their number nor their cycles show them. The video does: between two of its
+frames, the camera turns by a known angle. The rotations of all keyframes are estimated from those of the
+videos and from those of all pairs together, and pairs that do not fit are left out.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
+from bodycap_batch.mapping.matching.database import ImageRef, Pair
+from bodycap_batch.model.geometry import nearest_rotation, so3_exp, so3_log
+
+_MAX_ERROR_RAD = np.deg2rad(25.0)
+"""Maximum angle between the rotation of a pair and that of its keyframes. Evidence:
+docs/decisions/mapping.md."""
+_ERRORS_RAD = np.deg2rad((40.0, 35.0, 30.0, 25.0, 25.0))
+"""The same, in the steps of the estimation. At first, the rotations of the videos have drifted. Evidence:
+none."""
+_PAIR_SIGMA_RAD = np.deg2rad(5.0)
+"""Standard deviation of the rotation of a pair. Evidence: none."""
+_LINK_SIGMA_RAD = np.deg2rad(0.5)
+"""Standard deviation that is added to each rotation of a video. Evidence: none."""
+_SAME_RAD, _OTHER_RAD = np.deg2rad(20.0), np.deg2rad(35.0)
+"""Maximum angle between rotations that support each other, and minimum angle between rotations that exclude
+each other. Evidence: none."""
+_MIN_RATIO = 1.2
+"""Minimum ratio of the support of the best rotation to that of another one. Evidence: none."""
+_FULL_MATCHES = 100
+"""Number of matches with which a pair has its full weight. Evidence: none."""
+_NEAR_NS = 1_000_000_000
+"""Time (nanoseconds) within which a camera hardly comes to another place that looks alike. Evidence: none."""
+_MAX_VOTES = 1000
+"""Maximum number of pairs whose rotations are compared with each other. It bounds the time."""
+
+
+@dataclass(frozen=True, slots=True)
+class PairRotation:
+    """The rotation between the keyframes of a pair, from its matches.
+
+    Attributes:
+        pair: The keyframes.
+        rotation: (3,3) rotation second_from_first.
+        matches: Number of verified matches.
+    """
+
+    pair: Pair
+    rotation: FloatArray
+    matches: int
+
+
+def find_contradicted_pairs(
+    pairs: Sequence[PairRotation], cameras: Mapping[str, CameraIntrinsics]
+) -> set[Pair]:
+    """Return the pairs whose rotation contradicts that of the videos and of the other pairs.
+
+    Keyframes between which the video shows the rotation make a segment. The segments are joined by the
+    rotation that most pairs between them support: first by pairs of one camera that are near in time. If two different rotations have about the same support,
+    nothing shows which pairs are right: the segments stay apart, and the pairs between them are contradicted.
+
+    Args:
+        pairs: The verified pairs. Those with a camera whose rotation is unknown are not judged.
+        cameras: What is known of each camera, by name.
+
+    Source: Hartley et al., "Rotation averaging", IJCV 2013, for the problem; Yang et al., "Graduated
+        non-convexity for robust spatial perception", RA-L 2020, for the steps of the limit.
+    """
+    known = {name for name, camera in cameras.items() if camera.rotation_chain is not None}
+    judged = [item for item in pairs if known.issuperset((item.pair[0].camera, item.pair[1].camera))]
+    if not judged:
+        return set()
+    graph = _Graph(judged, cameras)
+    graph.join_segments(graph.near)
+    graph.join_segments(np.ones(len(judged), dtype=bool))
+    graph.adjust()
+    return {item.pair for item, wrong in zip(judged, graph.contradicted(), strict=True) if wrong}
+
+
+class _Graph:
+    """Rotations of keyframes, with those of videos and pairs between them.
+
+    Attributes:
+        near: (P,) True for the pairs of one camera whose keyframes are near in time.
+    """
+
+    def __init__(self, pairs: Sequence[PairRotation], cameras: Mapping[str, CameraIntrinsics]) -> None:
+        refs = sorted({ref for item in pairs for ref in item.pair})
+        row = {ref: number for number, ref in enumerate(refs)}
+        self._first = np.array([row[item.pair[0]] for item in pairs])
+        self._second = np.array([row[item.pair[1]] for item in pairs])
+        self._rotation = np.array([item.rotation for item in pairs])
+        self.near: BoolArray = np.array([_are_near(*item.pair, cameras) for item in pairs])
+        self._weight = np.minimum([item.matches for item in pairs], _FULL_MATCHES) / _FULL_MATCHES
+        self._world_from_cam = np.tile(np.eye(3), (len(refs), 1, 1))
+        self._segment = np.arange(len(refs))
+        links = list[tuple[int, int, FloatArray, float]]()
+        for last in range(1, len(refs)):
+            before, ref = refs[last - 1], refs[last]
+            chain = cameras[ref.camera].rotation_chain
+            found = None if chain is None else chain.between(before.frame, ref.frame)
+            if before.camera == ref.camera and found is not None:
+                links.append((last - 1, last, *found))
+                self._world_from_cam[last] = self._world_from_cam[last - 1] @ found[0].T
+                self._segment[last] = self._segment[last - 1]
+        self._links = (
+            np.array([link[0] for link in links], dtype=np.int64),
+            np.array([link[1] for link in links], dtype=np.int64),
+            np.array([link[2] for link in links]).reshape(-1, 3, 3),
+            np.array([link[3] for link in links]),
+        )
+
+    def join_segments(self, used: BoolArray) -> None:
+        """Turn all segments into one frame, the best supported ones first. Undecided ones stay apart.
+
+        Args:
+            used: (P,) True for the pairs that are used.
+        """
+        votes = dict[tuple[int, int], tuple[float, FloatArray] | None]()
+        while True:
+            between = self._pairs_between(used)
+            for key in between.keys() - votes.keys():
+                votes[key] = self._vote(key[0], between[key])
+            decided = {key: vote for key in between if (vote := votes[key]) is not None}
+            if not decided:
+                return
+            kept, turned = max(sorted(decided), key=lambda key: decided[key][0])
+            own = self._segment == turned
+            self._world_from_cam[own] = decided[kept, turned][1] @ self._world_from_cam[own]
+            self._segment[own] = kept
+            votes = {key: vote for key, vote in votes.items() if not {kept, turned} & set(key)}
+
+    def _pairs_between(self, used: BoolArray) -> dict[tuple[int, int], IntArray]:
+        """Return the rows of the used pairs between each two segments."""
+        segments = np.sort(self._segment[np.stack([self._first, self._second], axis=1)], axis=1)
+        rows = defaultdict[tuple[int, int], list[int]](list)
+        for number in np.flatnonzero(used & (segments[:, 0] != segments[:, 1])).tolist():
+            one, other = segments[number].tolist()
+            rows[one, other].append(number)
+        return {key: np.array(numbers) for key, numbers in rows.items()}
+
+    def _vote(self, kept: int, rows: IntArray) -> tuple[float, FloatArray] | None:
+        """Return the rotation that turns a segment into another one, and its support; None if undecided.
+
+        Args:
+            kept: The segment that is not turned.
+            rows: The pairs between both.
+        """
+        rows = rows[np.argsort(-self._weight[rows], kind="stable")[:_MAX_VOTES]]
+        is_kept = self._segment[self._first[rows]] == kept
+        rotation = np.where(
+            is_kept[:, None, None], self._rotation[rows], np.swapaxes(self._rotation[rows], 1, 2)
+        )
+        inside = np.where(is_kept, self._first[rows], self._second[rows])
+        outside = np.where(is_kept, self._second[rows], self._first[rows])
+        turn = (
+            self._world_from_cam[inside]
+            @ np.swapaxes(rotation, 1, 2)
+            @ np.swapaxes(self._world_from_cam[outside], 1, 2)
+        )
+        flat, weight = turn.reshape(-1, 9), self._weight[rows]
+        cosine = 0.5 * (flat @ flat.T - 1.0)
+        same = cosine > np.cos(_SAME_RAD)
+        support = same @ weight
+        best = int(np.argmax(support))
+        others = same @ (weight * (cosine[best] < np.cos(_OTHER_RAD)))
+        rival = float(others[cosine[best] < np.cos(_OTHER_RAD)].max(initial=0.0))
+        if support[best] < _MIN_RATIO * rival:
+            return None
+        mean = np.einsum("v,vij->ij", weight * same[best], turn)
+        return float(support[best]) - rival, nearest_rotation(mean)
+
+    def adjust(self) -> None:
+        """Adjust the rotations of all keyframes to those of the videos and of the pairs that fit."""
+        from scipy import sparse
+        from scipy.sparse.linalg import spsolve
+
+        first, second, rotation, sigma = self._links
+        link_weight = 1.0 / (sigma**2 + _LINK_SIGMA_RAD**2)
+        size = len(self._world_from_cam)
+        for limit in _ERRORS_RAD:
+            error = self._errors(self._first, self._second, self._rotation)
+            fits = self._same_segment() & (np.linalg.norm(error, axis=1) < limit)
+            start = np.concatenate([self._first[fits], first])
+            end = np.concatenate([self._second[fits], second])
+            error = np.concatenate([error[fits], self._errors(first, second, rotation)])
+            weight = np.concatenate([np.full(fits.sum(), _PAIR_SIGMA_RAD**-2), link_weight])
+            pull = weight[:, None] * np.einsum("eij,ej->ei", self._world_from_cam[end], error)
+            right = np.zeros((size, 3))
+            np.add.at(right, start, -pull)
+            np.add.at(right, end, pull)
+            entries = np.concatenate([weight, weight, -weight, -weight])
+            rows, columns = np.concatenate([start, end, start, end]), np.concatenate([start, end, end, start])
+            matrix = sparse.coo_matrix((entries, (rows, columns)), (size, size)).tocsc()
+            # The gauge of each segment is free.
+            turn = spsolve(matrix + 1e-6 * sparse.eye(size, format="csc"), right)
+            self._world_from_cam = so3_exp(np.asarray(turn).reshape(-1, 3)) @ self._world_from_cam
+
+    def contradicted(self) -> BoolArray:
+        """Return a mask (P,) of the pairs that do not fit."""
+        error = np.linalg.norm(self._errors(self._first, self._second, self._rotation), axis=1)
+        return np.asarray(~self._same_segment() | (error > _MAX_ERROR_RAD))
+
+    def _same_segment(self) -> BoolArray:
+        return np.asarray(self._segment[self._first] == self._segment[self._second])
+
+    def _errors(self, first: IntArray, second: IntArray, rotation: FloatArray) -> FloatArray:
+        """Return the rotation vectors (E,3) from rotations second_from_first to those of the keyframes."""
+        found = np.swapaxes(self._world_from_cam[second], 1, 2) @ self._world_from_cam[first]
+        return so3_log(found @ np.swapaxes(rotation, 1, 2))
+
+
+def _are_near(one: ImageRef, other: ImageRef, cameras: Mapping[str, CameraIntrinsics]) -> bool:
+    """Return whether two keyframes of one camera are near in time."""
+    times_ns = cameras[one.camera].times_ns
+    if one.camera != other.camera or times_ns is None:
+        return False
+    return bool(abs(times_ns[one.frame] - times_ns[other.frame]) < _NEAR_NS)
