@@ -63,8 +63,9 @@ def find_contradicted_pairs(
     """Return the pairs whose rotation contradicts that of the videos and of the other pairs.
 
     Keyframes between which the video shows the rotation make a segment. The segments are joined by the
-    rotation that most pairs between them support: first by pairs of one camera that are near in time. If two different rotations have about the same support,
-    nothing shows which pairs are right: the segments stay apart, and the pairs between them are contradicted.
+    rotation that most pairs between them support: first by pairs of one camera that are near in time. If two
+    different rotations have about the same support, nothing shows which pairs are right: the segments stay
+    apart, and the pairs between them are contradicted.
 
     Args:
         pairs: The verified pairs. Those with a camera whose rotation is unknown are not judged.
