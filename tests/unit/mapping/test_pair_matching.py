@@ -11,7 +11,7 @@ import pytest
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.mapping.matching.pair_matching import KeyframeFeatures, find_mutual_matches, verify_pair
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.geometry import so3_exp
+from bodycap_batch.model.geometry import so3_exp, so3_log
 
 _LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([420.0, 420.0, 320.0, 240.0]))
 _NONE = np.zeros((0, 128), np.uint8)
@@ -76,25 +76,33 @@ def _view(pixels: FloatArray, calibrated: bool) -> KeyframeFeatures:
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_verification_keeps_the_matches_of_one_motion(calibrated: bool) -> None:
     a, b, matches, right = _two_views(np.random.default_rng(3), calibrated=calibrated)
-    kept = verify_pair(matches, a, b)
+    found = verify_pair(matches, a, b)
+    kept = found.matches
     # 4 px is 8 sigma, so no right match is lost. A wrong match lies in a band of 8 of 480 px with a
     # probability of 2 %; 12 of 100 would be five sigma above that.
     assert set(range(right)) <= set(kept[:, 0].tolist())
     assert len(kept) <= right + 12
-    assert kept.tolist() == verify_pair(matches, a, b).tolist()
+    assert kept.tolist() == verify_pair(matches, a, b).matches.tolist()
+    if found.b_from_a is None:
+        assert not calibrated
+        return
+    error = so3_log(found.b_from_a[:, :3] @ so3_exp(np.array([0.02, 0.15, -0.03])).T)
+    direction = np.array([0.5, 0.05, 0.1]) / np.linalg.norm([0.5, 0.05, 0.1])
+    assert np.linalg.norm(error) < np.deg2rad(2.0)
+    assert found.b_from_a[:, 3] @ direction > np.cos(np.deg2rad(5.0))
 
 
 def test_unrelated_views_are_not_verified() -> None:
     a, b, matches, right = _two_views(np.random.default_rng(4), calibrated=True)
     # The best of 400 essential matrices explains a dozen or two of 100 wrong matches, never all.
-    assert len(verify_pair(matches[right:], a, b)) < 40
-    assert len(verify_pair(matches[:14], a, b)) == 0
+    assert len(verify_pair(matches[right:], a, b).matches) < 40
+    assert len(verify_pair(matches[:14], a, b).matches) == 0
 
 
 def test_a_calibrated_and_an_uncalibrated_camera_are_verified_in_pixels() -> None:
     a, _, matches, right = _two_views(np.random.default_rng(3), calibrated=True)
     _, b, _, _ = _two_views(np.random.default_rng(3), calibrated=False)
-    kept = verify_pair(matches, a, b)
+    kept = verify_pair(matches, a, b).matches
     assert set(range(right)) <= set(kept[:, 0].tolist())
     assert len(kept) <= right + 12
 
@@ -108,7 +116,7 @@ def test_a_fit_that_fails_inside_opencv_verifies_nothing(
 
     a, b, matches, _ = _two_views(np.random.default_rng(3), calibrated=calibrated)
     monkeypatch.setattr(cv2, "findEssentialMat" if calibrated else "findFundamentalMat", failing)
-    assert len(verify_pair(matches, a, b)) == 0
+    assert len(verify_pair(matches, a, b).matches) == 0
 
 
 @pytest.mark.parametrize("calibrated", [True, False])
@@ -124,7 +132,7 @@ def test_few_matches_need_few_samples(calibrated: bool, monkeypatch: pytest.Monk
     monkeypatch.setattr(cv2, name, recording)
     a, b, matches, right = _two_views(np.random.default_rng(5), calibrated=calibrated)
     wrong = matches[right:]
-    assert len(verify_pair(wrong[:16], a, b)) < 16
+    assert len(verify_pair(wrong[:16], a, b).matches) < 16
     verify_pair(wrong, a, b)
     # If 15 of 16 matches are correct, one sample in 1.4 (five matches) or 1.6 (seven) is correct.
     assert trials[0] <= 40
@@ -138,4 +146,4 @@ def test_a_pair_with_few_correct_matches_is_verified(calibrated: bool, wrong: in
         a, b, matches, right = _two_views(np.random.default_rng(100 + seed), calibrated=calibrated)
         few = np.concatenate([matches[:20], matches[right : right + wrong]])
         # All of the 20 correct matches are within 8 sigma, and 15 are enough.
-        assert len(verify_pair(few, a, b)) >= 15
+        assert len(verify_pair(few, a, b).matches) >= 15

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+import pycolmap
 
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.core.context import StageContext
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
-from bodycap_batch.mapping.matching.database import ImageRef, Pair
+from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef, Pair, read_image_ids
+from bodycap_batch.mapping.matching.pair_matching import match_pairs
 from bodycap_batch.mapping.matching.rotation_graph import PairRotation, find_contradicted_pairs
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.geometry import so3_exp
 from bodycap_batch.model.rotation_chain import RotationChain
+from tests.unit.mapping import wall
 
 LENS = Camera(model="PINHOLE", width_px=640, height_px=480, params=np.array([400.0, 400.0, 320.0, 240.0]))
 FRAMES, STEP = 240, 6
@@ -108,3 +114,25 @@ def test_pairs_of_a_camera_with_an_unknown_rotation_are_not_judged() -> None:
     assert find_contradicted_pairs(pairs, known(("head", None))) == set()
     mixed = overlapping("head", "palm", 90.0)
     assert find_contradicted_pairs(mixed, known(("head", chain("head")), ("palm", None))) == set()
+
+
+def test_contradicted_pairs_are_removed_from_the_database(tmp_path: Path) -> None:
+    wall.write_wall(tmp_path)
+    frames = np.arange(wall.KEYFRAMES)
+    turns = np.zeros((len(frames) - 1, 3))
+    turns[6, 1] = np.pi / 2
+    bay = RotationChain(frames=frames, turns=turns, sigma_rad=np.full(len(turns), 0.005), turn_sigma=0.05)
+    refs = [ImageRef("cam", frame) for frame in range(wall.KEYFRAMES)]
+    pairs = [(a, b) for a in refs for b in refs if 0 < b.frame - a.frame <= 5]
+    context = StageContext(work_dir=tmp_path, threads=1)
+    times_ns = frames.astype(np.int64) * 500_000_000
+    verified = match_pairs(
+        tmp_path, pairs, {"cam": CameraIntrinsics(wall.LENS, True, bay, times_ns)}, context
+    )
+    # The video turns by 90° behind frame 6; the other part of the wall only looks like the first one.
+    assert len(verified) > 30
+    assert not any(a.frame <= 6 < b.frame for a, b in verified)
+    with pycolmap.Database.open(str(tmp_path / DATABASE_NAME)) as database:
+        ids = read_image_ids(database)
+        stored = {(a, b) for a, b in pairs if database.exists_two_view_geometry(ids[a], ids[b])}
+    assert stored == verified.keys()
