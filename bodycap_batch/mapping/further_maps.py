@@ -86,10 +86,7 @@ def _further_maps(
     for name, number in ids.items():
         update_camera(workspace, number, capture.camera(name))
     calibrated_ids = calibrated_camera_ids(capture, ids)
-    mapping = replace(
-        make_mapping_context(workspace, capture, options, calibrated_ids, context, SKELETAL_ABOVE),
-        rotation_chains={camera.name: camera.rotation_chain for camera in capture.cameras},
-    )
+    mapping = make_mapping_context(workspace, capture, options, calibrated_ids, context, SKELETAL_ABOVE)
     models = list[Any]()
     while len(left) >= LEAST_MAPPED:
         context.check_cancelled()

@@ -12,7 +12,6 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.mechanisms import Mechanism, is_on
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
-from bodycap_batch.model.rotation_chain import RotationChain
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,8 +30,6 @@ class MappingContext:
         times_ns: Times of all frames of each camera, nanoseconds, by camera name.
         lens_sigma: By database id, the relative standard deviation of the focal length of those calibrated
             cameras whose lens was estimated from tracks. The last adjustment refines it.
-        rotation_chains: How each camera turns, by the tracks of its video, by camera name. Empty for the
-            first map: the contradictions for which a folded map is refused would be removed.
     """
 
     workspace: Path
@@ -44,7 +41,6 @@ class MappingContext:
     skeletal_above: int = SKELETAL_ABOVE
     times_ns: Mapping[str, IntArray] = field(default_factory=dict)
     lens_sigma: Mapping[int, float] = field(default_factory=dict)
-    rotation_chains: Mapping[str, RotationChain | None] = field(default_factory=dict)
 
     @property
     def given_ids(self) -> frozenset[int]:

@@ -23,7 +23,6 @@ from bodycap_batch.mapping.validation.epipolar_consistency import (
     find_misregistered_images,
     inconsistent_match_ratio,
 )
-from bodycap_batch.mapping.validation.folded_images import find_folded_images
 from bodycap_batch.mapping.validation.second_registration import confirm_images
 from bodycap_batch.mapping.validation.track_agreement import (
     evaluate_agreement,
@@ -152,7 +151,7 @@ def left_contradicted(repair: Mapping[str, Any], ratio: float) -> float:
 def find_wrong_images(
     context: MappingContext, model: pycolmap.Reconstruction, pairs: Sequence[PairConsistency]
 ) -> set[int]:
-    """Return the ids of the images whose pose or points contradict matches or the rotation of the video.
+    """Return the ids of the images whose pose or points contradict matches.
 
     If no part of the model agrees with itself, only the images that contradict the poses are returned.
 
@@ -161,7 +160,7 @@ def find_wrong_images(
         model: The model.
         pairs: The verified pairs of the model (`evaluate_pairs`).
     """
-    wrong = find_misregistered_images(pairs) | find_folded_images(model, context.rotation_chains)
+    wrong = find_misregistered_images(pairs)
     agreement = evaluate_agreement(context.workspace, model, context.times_ns)
     misplaced = find_misplaced_images(agreement, image_sequences(model))
     if model.num_reg_images() - len(wrong | misplaced) < MIN_MODEL_KEYFRAMES:
@@ -177,7 +176,7 @@ def _without_confirmed(
 ) -> set[int]:
     """Return the ids of the wrong images without those whose pose a second registration confirms.
 
-    An image whose pose contradicts its matches, or the rotation of its video, is never confirmed.
+    An image whose pose contradicts its matches is never confirmed.
 
     Args:
         context: Workspace, mapper options.
@@ -189,9 +188,7 @@ def _without_confirmed(
         return set(wrong)
     max_error_px = _CONFIRMED_ERROR_RATIO * context.mapper_options().mapper.filter_max_reproj_error
     confirmed = confirm_images(context.workspace, model, wrong, image_sequences(model), max_error_px)
-    acquitted = (
-        confirmed - find_misregistered_images(pairs) - find_folded_images(model, context.rotation_chains)
-    )
+    acquitted = confirmed - find_misregistered_images(pairs)
     record_act(Mechanism.SECOND_REGISTRATION, len(acquitted))
     return set(wrong) - acquitted
 

@@ -42,7 +42,6 @@ from bodycap_batch.mapping.validation.epipolar_consistency import (
     evaluate_pairs,
     find_misregistered_images,
 )
-from bodycap_batch.mapping.validation.folded_images import find_folded_images
 from bodycap_batch.mapping.validation.repair import remove_without_adjustment, repair_model
 from bodycap_batch.mapping.validation.second_registration import confirm_images
 from bodycap_batch.mapping.validation.track_agreement import (
@@ -54,8 +53,7 @@ from bodycap_batch.mapping.validation.track_agreement import (
 from bodycap_batch.mapping.validation.transient_points import remove_transient_points
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.camera import Camera
-from bodycap_batch.model.geometry import Similarity, align_points, invert, so3_exp, so3_log
-from bodycap_batch.model.rotation_chain import RotationChain
+from bodycap_batch.model.geometry import Similarity, align_points, invert
 from tests.misplaced import misplace
 from tests.unit.mapping.wall import KEYFRAMES, LENS, write_wall
 
@@ -238,34 +236,6 @@ def test_without_points_no_image_is_confirmed(
     assert confirm_images(mapping.workspace, model, sequences[0], sequences, 8.0) == set()
     # The only images that are left see nothing in common with the inconsistent ones.
     assert confirm_images(mapping.workspace, model, sequences[0][:-1], sequences, 8.0) == set()
-
-
-def _turns(poses: FloatArray, folded_from: int = KEYFRAMES) -> RotationChain:
-    """Return how the camera of some poses cam_from_map turns; the video turns further before one frame."""
-    rotations = poses[:, :3, :3].copy()
-    rotations[folded_from:] = so3_exp([0.0, np.pi / 2, 0.0]) @ rotations[folded_from:]
-    return RotationChain(
-        frames=np.arange(KEYFRAMES),
-        turns=so3_log(rotations[1:] @ np.swapaxes(rotations[:-1], 1, 2)),
-        sigma_rad=np.full(KEYFRAMES - 1, 1e-3),
-        turn_sigma=0.05,
-    )
-
-
-def test_keyframes_in_a_place_that_looks_alike_contradict_the_rotation_of_the_video(
-    built: tuple[Any, FloatArray, MappingContext, set[Any]],
-) -> None:
-    model, poses, mapping, _ = built
-    numbers = {ImageRef.parse(model.image(i).name).frame: int(i) for i in model.reg_image_ids()}
-    assert find_folded_images(model, {"cam": _turns(poses)}) == set()
-    assert find_folded_images(model, {"cam": None}) == set()
-    # All matches agree, as in a room with identical bays. Only the video turned by 90 degrees between.
-    turns = {"cam": _turns(poses, folded_from=10)}
-    assert find_folded_images(model, turns) == {numbers[frame] for frame in range(10, KEYFRAMES)}
-    kept, removed, _ = remove_without_adjustment(model, replace(mapping, rotation_chains=turns))
-    assert len(removed) == KEYFRAMES - 10
-    assert kept.num_reg_images() == 10
-    assert remove_without_adjustment(model, mapping)[1] == []
 
 
 def _without_points(model: Any) -> Any:
