@@ -31,6 +31,7 @@ from tests.bench import (
     mappers,
     measure,
     ours,
+    pairs,
     peers,
     real,
     scale,
@@ -76,6 +77,7 @@ _WITH_OPTIONS = {
     "violent": violent.main,
     "mappers": mappers.main,
     "paired": paired.main,
+    "pairs": pairs.main,
     "real": real.main,
     "measure": measure.main,
     "verdict": verdict.main,
@@ -101,7 +103,8 @@ def main() -> int:
         "flexion with a height alone), `scale` (the metric scale with a height alone), `slips` (mounts that "
         "slip), `bare` (a camera at plain surfaces), `shutter` (drawn readout times against global "
         "shutters), `mappers` (the incremental and the global mapper), `paired` (two versions on perturbed "
-        "captures), `real` (the table of the real captures), `measure` (how well the pictures judge poses), "
+        "captures), `pairs` (pairs that only look alike), "
+        "`real` (the table of the real captures), `measure` (how well the pictures judge poses), "
         "`synth` (seconds of a rendered frame), `verdict` (grades of stored results), `drawn` (renders the "
         "drawn captures), `lens` (the lens from tracks), and `long` (ten minutes of three cameras)",
     )

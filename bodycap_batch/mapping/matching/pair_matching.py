@@ -154,19 +154,26 @@ def _remove_contradicted(
 
     if not is_on(Mechanism.PAIR_ROTATIONS):
         return set()
-    ref_of = {number: ref for ref, number in ids.items()}
-    pairs = []
-    for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
-        first, second = (ref_of[number] for number in pycolmap.pair_id_to_image_pair(pair_id))
-        if geometry.cam2_from_cam1 is not None:
-            rotation = geometry.cam2_from_cam1.rotation.matrix()
-            pairs.append(PairRotation((first, second), rotation, len(geometry.inlier_matches)))
-    found = find_contradicted_pairs(pairs, intrinsics)
+    found = find_contradicted_pairs(read_pair_rotations(database), intrinsics)
     with pycolmap.DatabaseTransaction(database):
         for first, second in sorted(found):
             database.delete_two_view_geometry(ids[first], ids[second])
     record_act(Mechanism.PAIR_ROTATIONS, len(found))
     return found
+
+
+def read_pair_rotations(database: pycolmap.Database) -> list[PairRotation]:
+    """Return the rotations of the verified pairs of calibrated cameras."""
+    import pycolmap
+
+    ref_of = {number: ref for ref, number in read_image_ids(database).items()}
+    out = []
+    for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
+        if geometry.cam2_from_cam1 is not None:
+            first, second = (ref_of[number] for number in pycolmap.pair_id_to_image_pair(pair_id))
+            rotation = geometry.cam2_from_cam1.rotation.matrix()
+            out.append(PairRotation((first, second), rotation, len(geometry.inlier_matches)))
+    return out
 
 
 def _read_features(
