@@ -22,7 +22,6 @@ from bodycap_batch.mapping.reconstruction import conversion
 from bodycap_batch.mapping.reconstruction.camera_motion import CameraMotion
 from bodycap_batch.mapping.reconstruction.keyframe_covariance import keyframe_covariances
 from bodycap_batch.model.geometry import align_points
-from bodycap_batch.model.rolling_shutter import has_visible_rolling_shutter
 from bodycap_batch.model.scene import KeyframeSelection, Map, MapResult, Registration, Trajectory
 from bodycap_batch.registration import register_frames
 
@@ -92,7 +91,6 @@ def test_every_frame_is_registered(outcome: Outcome) -> None:
 
 def test_the_rolling_shutter_is_found_and_taken_out(outcome: Outcome, data_root: Path) -> None:
     truth = data_root / "tum_fr1_xyz" / "groundtruth.txt"
-    assert has_visible_rolling_shutter(outcome.before, outcome.maps[0].maps)
     readout_s = outcome.refined.maps[0].readout_s["camera"]
     assert abs(readout_s - READOUT_S) < 0.002
     before, _ = ate_m(outcome.before.trajectory, truth)

@@ -27,16 +27,16 @@ def test_the_environment_names_what_is_off_in_a_process_without_a_task(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(mechanisms._task, "off", None)
-    monkeypatch.setenv(mechanisms.VARIABLE, "join_models, repair")
-    assert mechanisms.switched_off() == {Mechanism.JOIN_MODELS, Mechanism.REPAIR}
+    monkeypatch.setenv(mechanisms.VARIABLE, "skeletal_set, repair")
+    assert mechanisms.switched_off() == {Mechanism.SKELETAL_SET, Mechanism.REPAIR}
     assert not mechanisms.is_on(Mechanism.REPAIR)
     assert mechanisms.is_on(Mechanism.RECOVERY)
 
 
 def test_a_task_uses_the_switches_of_its_key_and_counts_from_zero(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(mechanisms.VARIABLE, "repair")
-    mechanisms.begin_task({mechanisms.KEY_OPTION: ["join_models"], "features": 512})
-    assert mechanisms.switched_off() == {Mechanism.JOIN_MODELS}
+    mechanisms.begin_task({mechanisms.KEY_OPTION: ["skeletal_set"], "features": 512})
+    assert mechanisms.switched_off() == {Mechanism.SKELETAL_SET}
     mechanisms.record_act(Mechanism.REPAIR, 2)
     mechanisms.record_act(Mechanism.RECOVERY, 0)
     assert mechanisms.acted() == {"repair": 2}
@@ -48,7 +48,7 @@ def test_a_task_uses_the_switches_of_its_key_and_counts_from_zero(monkeypatch: p
 def test_an_unknown_mechanism_is_an_error_that_names_the_known_ones() -> None:
     with pytest.raises(JobError, match="unknown mechanism joining") as caught:
         mechanisms.mechanisms_of(["joining"])
-    assert "join_models" in (caught.value.hint or "")
+    assert "skeletal_set" in (caught.value.hint or "")
 
 
 @pytest.mark.parametrize("mechanism", list(Mechanism))

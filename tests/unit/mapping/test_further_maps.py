@@ -1,4 +1,4 @@
-"""Further maps of lost keyframes: what the rotation of the video contradicts is taken out of them."""
+"""Further maps of lost keyframes hold no pairs that the rotation of the video contradicts."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ def test_keyframes_after_a_turn_that_the_map_does_not_show_are_not_in_it(
     refs = [ImageRef("cam", frame) for frame in range(KEYFRAMES)]
     pairs = [(a, b) for a in refs for b in refs if a < b and b.frame - a.frame <= 5]
     context = StageContext(work_dir=work, threads=2)
-    match_pairs(earlier, pairs, {"cam": CameraIntrinsics(LENS, calibrated=True)}, context)
     chain = RotationChain(
         frames=np.arange(KEYFRAMES),
         turns=so3_log(rotations[1:] @ np.swapaxes(rotations[:-1], 1, 2)),
         sigma_rad=np.full(KEYFRAMES - 1, 1e-3),
         turn_sigma=0.05,
     )
+    match_pairs(earlier, pairs, {"cam": CameraIntrinsics(LENS, True, chain, CAMERA.times_ns)}, context)
     capture = Capture(cameras=(replace(CAMERA, rotation_chain=chain),))
     previous = MapResult(maps=(small_map(),), workspace=earlier, log={})
     result = map_lost_keyframes(capture, previous, [NOTHING_POSED], MapOptions(), context)
