@@ -8,7 +8,6 @@ videos and from those of all pairs together, and pairs that do not fit are left 
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -141,11 +140,13 @@ class _Graph:
     def _pairs_between(self, used: BoolArray) -> dict[tuple[int, int], IntArray]:
         """Return the rows of the used pairs between each two segments."""
         segments = np.sort(self._segment[np.stack([self._first, self._second], axis=1)], axis=1)
-        rows = defaultdict[tuple[int, int], list[int]](list)
-        for number in np.flatnonzero(used & (segments[:, 0] != segments[:, 1])).tolist():
-            one, other = segments[number].tolist()
-            rows[one, other].append(number)
-        return {key: np.array(numbers) for key, numbers in rows.items()}
+        rows = np.flatnonzero(used & (segments[:, 0] != segments[:, 1]))
+        if not len(rows):
+            return {}
+        keys, inverse = np.unique(segments[rows], axis=0, return_inverse=True)
+        order = np.argsort(inverse.ravel(), kind="stable")
+        groups = np.split(rows[order], np.cumsum(np.bincount(inverse.ravel(), minlength=len(keys)))[:-1])
+        return {(int(one), int(other)): group for (one, other), group in zip(keys, groups, strict=True)}
 
     def _vote(self, kept: int, rows: IntArray) -> tuple[float, FloatArray] | None:
         """Return the rotation that turns a segment into another one, and its support; None if undecided.
