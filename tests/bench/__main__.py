@@ -28,7 +28,6 @@ from tests.bench import (
     lens_from_tracks,
     lenses,
     long,
-    mappers,
     measure,
     ours,
     pairs,
@@ -75,7 +74,6 @@ _WITH_OPTIONS = {
     "lenses": lenses.main,
     "lens": lens_from_tracks.main,
     "violent": violent.main,
-    "mappers": mappers.main,
     "paired": paired.main,
     "pairs": pairs.main,
     "real": real.main,
@@ -102,8 +100,7 @@ def main() -> int:
         "`lenses` (named profiles in the adjustment), `body` (joints without cameras), `elbows` (their "
         "flexion with a height alone), `scale` (the metric scale with a height alone), `slips` (mounts that "
         "slip), `bare` (a camera at plain surfaces), `shutter` (drawn readout times against global "
-        "shutters), `mappers` (the incremental and the global mapper), `paired` (two versions on perturbed "
-        "captures), `pairs` (pairs that only look alike), "
+        "shutters), `paired` (two versions on perturbed captures), `pairs` (pairs that only look alike), "
         "`real` (the table of the real captures), `measure` (how well the pictures judge poses), "
         "`synth` (seconds of a rendered frame), `verdict` (grades of stored results), `drawn` (renders the "
         "drawn captures), `lens` (the lens from tracks), and `long` (ten minutes of three cameras)",
