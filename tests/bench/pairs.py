@@ -1,7 +1,8 @@
 """Pairs that only look alike: how many of them the rotation of the videos shows.
 
 ``python -m tests.bench pairs FOLDER... --out FOLDER``: captures with true paths, without the removal of such
-pairs. A pair is wrong if its rotation differs by more than 25° from the truth, and right below 15°.
+pairs. A pair is wrong if its rotation differs by more than 25° from the truth, and right below 15°. With
+``--set NAME=VALUE``, a constant of `rotation_graph` has another value.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from bodycap_batch.capture import CaptureCamera, open_capture
 from bodycap_batch.config.job import load_job
 from bodycap_batch.core.mechanisms import VARIABLE, Mechanism
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
+from bodycap_batch.mapping.matching import rotation_graph
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef
 from bodycap_batch.mapping.matching.pair_matching import read_pair_rotations
-from bodycap_batch.mapping.matching.rotation_graph import find_contradicted_pairs
 from bodycap_batch.model.geometry import so3_log
 from bodycap_batch.tasks.loading import load_keyframes
 from tests.bench.measure import true_poses
@@ -36,7 +37,13 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.bench pairs", description=__doc__)
     parser.add_argument("captures", nargs="+", type=Path, metavar="FOLDER", help="folders of captures")
     parser.add_argument("--out", type=Path, required=True, help="folder of the results, kept")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="vary a constant")
     options = parser.parse_args(arguments)
+    for item in options.set:
+        name, _, value = item.partition("=")
+        if not hasattr(rotation_graph, name):
+            raise SystemExit(f"rotation_graph has no constant {name}")
+        setattr(rotation_graph, name, float(value))
     for folder in options.captures:
         store = options.out / folder.name
         if not any(store.glob("artefacts/map/*")):
@@ -69,7 +76,7 @@ def _figures(folder: Path, store: Path, cameras: Sequence[CaptureCamera]) -> str
     workspace = next(store.glob("artefacts/map/*/workspace"))
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
         pairs = read_pair_rotations(database)
-    found = find_contradicted_pairs(pairs, known)
+    found = rotation_graph.find_contradicted_pairs(pairs, known)
 
     def rotation(ref: ImageRef) -> np.ndarray:
         return np.asarray(truth[ref.camera][ref.frame, :3, :3])

@@ -172,7 +172,7 @@ def read_pair_rotations(database: pycolmap.Database) -> list[PairRotation]:
         if geometry.cam2_from_cam1 is not None:
             first, second = (ref_of[number] for number in pycolmap.pair_id_to_image_pair(pair_id))
             rotation = geometry.cam2_from_cam1.rotation.matrix()
-            out.append(PairRotation((first, second), rotation, len(geometry.inlier_matches)))
+            out.append(PairRotation((first, second), rotation))
     return out
 
 
@@ -300,7 +300,7 @@ def verify_pair(matches: IntArray, a: KeyframeFeatures, b: KeyframeFeatures) -> 
     if kept is None:
         return none
     inside = kept.ravel().astype(bool)
-    if essential is None or essential.shape != (3, 3) or inside.sum() < MIN_INLIERS:
+    if essential is None or inside.sum() < MIN_INLIERS:
         return VerifiedMatches(matches[inside])
     _, rotation, direction, _ = cv2.recoverPose(essential, first[inside], second[inside], np.eye(3))
     return VerifiedMatches(matches[inside], np.hstack([rotation, direction]))

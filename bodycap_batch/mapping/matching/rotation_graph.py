@@ -13,30 +13,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
 from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
-from bodycap_batch.mapping.matching.database import ImageRef, Pair
+from bodycap_batch.mapping.matching.database import Pair
+from bodycap_batch.mapping.matching.near_pairs import are_near
 from bodycap_batch.model.geometry import nearest_rotation, so3_exp, so3_log
 
 _MAX_ERROR_RAD = np.deg2rad(25.0)
 """Maximum angle between the rotation of a pair and that of its keyframes. Evidence:
 docs/decisions/mapping.md."""
-_ERRORS_RAD = np.deg2rad((40.0, 35.0, 30.0, 25.0, 25.0))
-"""The same, in the steps of the estimation. At first, the rotations of the videos have drifted. Evidence:
+_FIRST_ERRORS_RAD = np.deg2rad((40.0, 35.0, 30.0))
+"""The same, in the first steps of the estimation: the rotations of the videos have drifted. Evidence:
 none."""
 _PAIR_SIGMA_RAD = np.deg2rad(5.0)
-"""Standard deviation of the rotation of a pair. Evidence: none."""
+"""Standard deviation of the rotation of a pair. Evidence: docs/decisions/mapping.md."""
 _LINK_SIGMA_RAD = np.deg2rad(0.5)
-"""Standard deviation that is added to each rotation of a video. Evidence: none."""
+"""Standard deviation that is added to each rotation of a video. Evidence: docs/decisions/mapping.md."""
 _SAME_RAD, _OTHER_RAD = np.deg2rad(20.0), np.deg2rad(35.0)
 """Maximum angle between rotations that support each other, and minimum angle between rotations that exclude
-each other. Evidence: none."""
+each other. Evidence: docs/decisions/mapping.md."""
 _MIN_RATIO = 1.2
-"""Minimum ratio of the support of the best rotation to that of another one. Evidence: none."""
-_FULL_MATCHES = 100
-"""Number of matches with which a pair has its full weight. Evidence: none."""
-_NEAR_NS = 1_000_000_000
-"""Time (nanoseconds) within which a camera hardly comes to another place that looks alike. Evidence: none."""
+"""Minimum ratio of the number of pairs that support the best rotation to those of another one. Evidence:
+docs/decisions/mapping.md."""
 _MAX_VOTES = 1000
 """Maximum number of pairs whose rotations are compared with each other. It bounds the time."""
 
@@ -48,12 +46,10 @@ class PairRotation:
     Attributes:
         pair: The keyframes.
         rotation: (3,3) rotation second_from_first.
-        matches: Number of verified matches.
     """
 
     pair: Pair
     rotation: FloatArray
-    matches: int
 
 
 def find_contradicted_pairs(
@@ -97,8 +93,8 @@ class _Graph:
         self._first = np.array([row[item.pair[0]] for item in pairs])
         self._second = np.array([row[item.pair[1]] for item in pairs])
         self._rotation = np.array([item.rotation for item in pairs])
-        self.near: BoolArray = np.array([_are_near(*item.pair, cameras) for item in pairs])
-        self._weight = np.minimum([item.matches for item in pairs], _FULL_MATCHES) / _FULL_MATCHES
+        times_ns = {name: item.times_ns for name, item in cameras.items() if item.times_ns is not None}
+        self.near: BoolArray = np.array([are_near(*item.pair, times_ns) for item in pairs])
         self._world_from_cam = np.tile(np.eye(3), (len(refs), 1, 1))
         self._segment = np.arange(len(refs))
         links = list[tuple[int, int, FloatArray, float]]()
@@ -123,7 +119,7 @@ class _Graph:
         Args:
             used: (P,) True for the pairs that are used.
         """
-        votes = dict[tuple[int, int], tuple[float, FloatArray] | None]()
+        votes = dict[tuple[int, int], tuple[int, FloatArray] | None]()
         while True:
             between = self._pairs_between(used)
             for key in between.keys() - votes.keys():
@@ -148,36 +144,41 @@ class _Graph:
         groups = np.split(rows[order], np.cumsum(np.bincount(inverse.ravel(), minlength=len(keys)))[:-1])
         return {(int(one), int(other)): group for (one, other), group in zip(keys, groups, strict=True)}
 
-    def _vote(self, kept: int, rows: IntArray) -> tuple[float, FloatArray] | None:
+    def _vote(self, kept: int, rows: IntArray) -> tuple[int, FloatArray] | None:
         """Return the rotation that turns a segment into another one, and its support; None if undecided.
+
+        The support is the number of pairs that agree, minus that of the next best rotation.
 
         Args:
             kept: The segment that is not turned.
             rows: The pairs between both.
         """
-        rows = rows[np.argsort(-self._weight[rows], kind="stable")[:_MAX_VOTES]]
-        is_kept = self._segment[self._first[rows]] == kept
-        rotation = np.where(
-            is_kept[:, None, None], self._rotation[rows], np.swapaxes(self._rotation[rows], 1, 2)
-        )
-        inside = np.where(is_kept, self._first[rows], self._second[rows])
-        outside = np.where(is_kept, self._second[rows], self._first[rows])
-        turn = (
-            self._world_from_cam[inside]
-            @ np.swapaxes(rotation, 1, 2)
-            @ np.swapaxes(self._world_from_cam[outside], 1, 2)
-        )
-        flat, weight = turn.reshape(-1, 9), self._weight[rows]
+        turn = self._turns(kept, rows[evenly_spaced(len(rows), _MAX_VOTES)])
+        flat = turn.reshape(-1, 9)
         cosine = 0.5 * (flat @ flat.T - 1.0)
         same = cosine > np.cos(_SAME_RAD)
-        support = same @ weight
-        best = int(np.argmax(support))
-        others = same @ (weight * (cosine[best] < np.cos(_OTHER_RAD)))
-        rival = float(others[cosine[best] < np.cos(_OTHER_RAD)].max(initial=0.0))
-        if support[best] < _MIN_RATIO * rival:
+        best = int(np.argmax(same.sum(axis=1)))
+        other = cosine[best] < np.cos(_OTHER_RAD)
+        support, next_best = int(same[best].sum()), int(same[other][:, other].sum(axis=1).max(initial=0))
+        if support < _MIN_RATIO * next_best:
             return None
-        mean = np.einsum("v,vij->ij", weight * same[best], turn)
-        return float(support[best]) - rival, nearest_rotation(mean)
+        return support - next_best, nearest_rotation(turn[same[best]].sum(axis=0))
+
+    def _turns(self, kept: int, rows: IntArray) -> FloatArray:
+        """Return, for each of some pairs between two segments, the rotation that turns one into the other.
+
+        Args:
+            kept: The segment that is not turned.
+            rows: The pairs between both.
+        """
+        is_kept = self._segment[self._first[rows]] == kept
+        inside = np.where(is_kept, self._first[rows], self._second[rows])
+        outside = np.where(is_kept, self._second[rows], self._first[rows])
+        outside_from_inside = np.where(
+            is_kept[:, None, None], self._rotation[rows], np.swapaxes(self._rotation[rows], 1, 2)
+        )
+        found = self._world_from_cam[inside] @ np.swapaxes(outside_from_inside, 1, 2)
+        return np.asarray(found @ np.swapaxes(self._world_from_cam[outside], 1, 2))
 
     def adjust(self) -> None:
         """Adjust the rotations of all keyframes to those of the videos and of the pairs that fit."""
@@ -187,7 +188,7 @@ class _Graph:
         first, second, rotation, sigma = self._links
         link_weight = 1.0 / (sigma**2 + _LINK_SIGMA_RAD**2)
         size = len(self._world_from_cam)
-        for limit in _ERRORS_RAD:
+        for limit in (*_FIRST_ERRORS_RAD, _MAX_ERROR_RAD, _MAX_ERROR_RAD):
             error = self._errors(self._first, self._second, self._rotation)
             fits = self._same_segment() & (np.linalg.norm(error, axis=1) < limit)
             start = np.concatenate([self._first[fits], first])
@@ -217,11 +218,3 @@ class _Graph:
         """Return the rotation vectors (E,3) from rotations second_from_first to those of the keyframes."""
         found = np.swapaxes(self._world_from_cam[second], 1, 2) @ self._world_from_cam[first]
         return so3_log(found @ np.swapaxes(rotation, 1, 2))
-
-
-def _are_near(one: ImageRef, other: ImageRef, cameras: Mapping[str, CameraIntrinsics]) -> bool:
-    """Return whether two keyframes of one camera are near in time."""
-    times_ns = cameras[one.camera].times_ns
-    if one.camera != other.camera or times_ns is None:
-        return False
-    return bool(abs(times_ns[one.frame] - times_ns[other.frame]) < _NEAR_NS)

@@ -14,7 +14,7 @@ from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.core.percent import format_percent
 from bodycap_batch.mapping.matching.database import DATABASE_NAME
-from bodycap_batch.mapping.validation.near_pairs import NO_TIMES, NearPairs
+from bodycap_batch.mapping.matching.near_pairs import NO_TIMES, NearPairs
 from bodycap_batch.model.optical_flow import pixel_scale
 
 if TYPE_CHECKING:

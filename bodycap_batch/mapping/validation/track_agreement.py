@@ -17,7 +17,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef
-from bodycap_batch.mapping.validation.near_pairs import NO_TIMES, NearPairs
+from bodycap_batch.mapping.matching.near_pairs import NO_TIMES, NearPairs
 from bodycap_batch.mapping.validation.second_registration import observed_points
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from bodycap_batch.mapping.validation.near_pairs import NO_TIMES, NearPairs
+from bodycap_batch.mapping.matching.near_pairs import NO_TIMES, NearPairs
 
 TIMES = {"torso": np.arange(10) * 10**9, "palm": np.arange(10) * 10**9}
 NAMES = {1: "torso/0000000", 2: "torso/0000002", 3: "torso/0000003", 4: "palm/0000000", 5: "other/0000000"}

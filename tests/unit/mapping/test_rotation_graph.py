@@ -48,12 +48,12 @@ def known(*chains: tuple[str, RotationChain | None]) -> dict[str, CameraIntrinsi
     return {name: CameraIntrinsics(LENS, True, each, times_ns) for name, each in chains}
 
 
-def looks_like(first: ImageRef, second: ImageRef, turned_deg: float = 0.0, matches: int = 60) -> PairRotation:
+def looks_like(first: ImageRef, second: ImageRef, turned_deg: float = 0.0) -> PairRotation:
     """A pair whose second keyframe looks as if the camera were turned further by `turned_deg`."""
     rng = np.random.default_rng(first.frame * 1000 + second.frame)
     noise = so3_exp(rng.normal(0.0, np.deg2rad(2.0), 3))
     rotation = yaw(heading_deg(second) + turned_deg).T @ yaw(heading_deg(first)) @ noise
-    return PairRotation((first, second), rotation, matches)
+    return PairRotation((first, second), rotation)
 
 
 def overlapping(camera: str, other: str, turned_deg: float = 0.0) -> list[PairRotation]:

@@ -24,26 +24,34 @@ NO_TIMES: Mapping[str, IntArray] = MappingProxyType({})
 """No camera has times: no pair is near."""
 
 
+def are_near(one: ImageRef, other: ImageRef, times_ns: Mapping[str, IntArray]) -> bool:
+    """Return whether two keyframes are of one camera and near in time.
+
+    Args:
+        one: A keyframe.
+        other: Another keyframe.
+        times_ns: Times (N,) of all frames of each camera, nanoseconds, by camera name. No pair of a camera
+            without times is near.
+    """
+    times = times_ns.get(one.camera) if one.camera == other.camera else None
+    return times is not None and bool(abs(int(times[one.frame]) - int(times[other.frame])) <= NEAR_NS)
+
+
 class NearPairs:
     """States which pairs of images of a model are near in time.
 
     Args:
         model: The model.
-        times_ns: Times (N,) of all frames of each camera, nanoseconds, by camera name. No pair of a camera
-            without times is near.
+        times_ns: As in `are_near`.
     """
 
     def __init__(self, model: pycolmap.Reconstruction, times_ns: Mapping[str, IntArray]) -> None:
-        refs = {int(number): ImageRef.parse(model.image(number).name) for number in model.reg_image_ids()}
-        self._time = {
-            number: (ref.camera, int(times_ns[ref.camera][ref.frame]))
-            for number, ref in refs.items()
-            if ref.camera in times_ns
+        self._times_ns = times_ns
+        self._refs = {
+            int(number): ImageRef.parse(model.image(number).name) for number in model.reg_image_ids()
         }
 
     def __contains__(self, pair: tuple[int, int]) -> bool:
         """Return whether two images, by their ids, are of one camera and near in time."""
-        one, other = (self._time.get(number) for number in pair)
-        if one is None or other is None or one[0] != other[0]:
-            return False
-        return abs(one[1] - other[1]) <= NEAR_NS
+        one, other = (self._refs.get(number) for number in pair)
+        return one is not None and other is not None and are_near(one, other, self._times_ns)
