@@ -189,7 +189,7 @@ class _Refinement:
         sideways = {name for name, readout in {**self.from_matches, **known}.items() if readout.sideways}
         sideways |= sideways_cameras(self.cameras, self.scene_map)
         rolling = self.rolling.with_sideways(sideways)
-        readouts = {**known, **rolling.find_unknown(known, self.equal_cameras)}
+        readouts = {**known, **rolling.find_unknown_readouts(known, self.equal_cameras)}
         if not (readout_s := _seconds(readouts)):
             return self._unchanged(rolling, readouts)
         if (refined := self._with_velocities(rolling, readouts)) is not None:

@@ -10,7 +10,7 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
 from bodycap_batch.model.geometry import so3_exp, so3_log
 
-_MIN_ANGLE_RAD = float(np.deg2rad(45.0))
+MIN_ANGLE_RAD = float(np.deg2rad(45.0))
 """Minimum angle between two rotations that contradict each other. Origin: rooms repeat themselves at right
 angles; half of one separates a place from the next one that looks alike."""
 _MIN_SIGMAS = 5.0
@@ -74,7 +74,7 @@ class RotationChain:
             return None
         rotation, sigma = found
         error = float(np.linalg.norm(so3_log(world_from_cam[1].T @ world_from_cam[0] @ rotation.T)))
-        return error <= max(_MIN_ANGLE_RAD, _MIN_SIGMAS * sigma)
+        return error <= max(MIN_ANGLE_RAD, _MIN_SIGMAS * sigma)
 
 
 def find_folded(chain: RotationChain | None, frames: IntArray, world_from_cam: FloatArray) -> BoolArray:

@@ -401,14 +401,16 @@ class RollingShutterModel:
             return item.px
         return path.px_at_mid_row(self._intrinsics[item.camera], item.frame, item.points, item.px, readout_s)
 
-    def find_unknown(
+    def find_unknown_readouts(
         self, known: Mapping[str, Readout], equal_cameras: Sequence[Sequence[str]] = ()
     ) -> dict[str, Readout]:
         """Estimate the readout times that are not known, in an adjustment of a part of the model.
 
         The part has the successive keyframes of each camera with the largest motion. Poses, points,
         velocities and readout times are adjusted together. A readout time stays unknown if no value up to
-        20 ms displaces the keypoints of the camera by more than their noise: then it is not needed.
+        20 ms displaces the keypoints of the camera by more than their noise: then it is not needed. It also
+        stays unknown if the adjustment makes it longer than a frame interval. The other cameras are then
+        estimated without this camera's shutter.
 
         Args:
             known: The readout times that are known, by camera name.
@@ -431,9 +433,15 @@ class RollingShutterModel:
         nothing = {
             name: judged_readout(0.0, math.inf, sideways=item.sideways) for name, item in unknown.items()
         }
-        if adjusted is None:
+        if adjusted is not None:
+            return {name: adjusted.readouts[name] for name in unknown}
+        if len(unknown) == 1:
             return nothing
-        return nothing | {name: adjusted.readouts[name] for name in unknown.keys() & adjusted.readouts.keys()}
+        alone = {name: {**known, **nothing} for name in unknown}
+        for name, others in alone.items():
+            del others[name]
+            nothing |= self.find_unknown_readouts(others, equal_cameras)
+        return nothing
 
     def _most_dynamic_part(self) -> RollingShutterModel:
         """Return a smaller model: for each camera, only the successive keyframes with the largest motion."""

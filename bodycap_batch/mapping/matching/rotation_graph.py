@@ -18,13 +18,11 @@ from bodycap_batch.mapping.camera_intrinsics import CameraIntrinsics
 from bodycap_batch.mapping.matching.database import Pair
 from bodycap_batch.mapping.matching.near_pairs import are_near
 from bodycap_batch.model.geometry import nearest_rotation, so3_exp, so3_log
+from bodycap_batch.model.rotation_chain import MIN_ANGLE_RAD
 
-_MAX_ERROR_RAD = np.deg2rad(25.0)
-"""Maximum angle between the rotation of a pair and that of its keyframes. Evidence:
-docs/decisions/mapping.md."""
-_FIRST_ERRORS_RAD = np.deg2rad((40.0, 35.0, 30.0))
-"""The same, in the first steps of the estimation: the rotations of the videos have drifted. Evidence:
-none."""
+_FIT_ERRORS_RAD = np.deg2rad((40.0, 35.0, 30.0, 25.0, 25.0))
+"""Maximum angle between the rotation of a pair and that of its keyframes, so that the pair is used, in each
+step of the estimation: at first, the rotations of the videos have drifted. Evidence: none."""
 _PAIR_SIGMA_RAD = np.deg2rad(5.0)
 """Standard deviation of the rotation of a pair. Evidence: docs/decisions/mapping.md."""
 _LINK_SIGMA_RAD = np.deg2rad(0.5)
@@ -188,7 +186,7 @@ class _Graph:
         first, second, rotation, sigma = self._links
         link_weight = 1.0 / (sigma**2 + _LINK_SIGMA_RAD**2)
         size = len(self._world_from_cam)
-        for limit in (*_FIRST_ERRORS_RAD, _MAX_ERROR_RAD, _MAX_ERROR_RAD):
+        for limit in _FIT_ERRORS_RAD:
             error = self._errors(self._first, self._second, self._rotation)
             fits = self._same_segment() & (np.linalg.norm(error, axis=1) < limit)
             start = np.concatenate([self._first[fits], first])
@@ -209,7 +207,7 @@ class _Graph:
     def contradicted(self) -> BoolArray:
         """Return a mask (P,) of the pairs that do not fit."""
         error = np.linalg.norm(self._errors(self._first, self._second, self._rotation), axis=1)
-        return np.asarray(~self._same_segment() | (error > _MAX_ERROR_RAD))
+        return np.asarray(~self._same_segment() | (error > MIN_ANGLE_RAD))
 
     def _same_segment(self) -> BoolArray:
         return np.asarray(self._segment[self._first] == self._segment[self._second])

@@ -138,7 +138,7 @@ def rolling_model(film: Film, *, known: bool = False, stated_s: float = 0.0, pos
 
 def found(readout_s: float) -> Readout:
     """Return the readout time that is found if nothing is known of it."""
-    return dict(rolling_model(Film(readout_s)).find_unknown({}))["head"]
+    return dict(rolling_model(Film(readout_s)).find_unknown_readouts({}))["head"]
 
 
 @pytest.mark.parametrize("readout_s", [0.02, -0.012])
@@ -157,13 +157,13 @@ def test_a_global_shutter_is_left_alone() -> None:
 
 
 def test_a_known_readout_time_is_not_looked_for() -> None:
-    assert rolling_model(Film(0.02)).find_unknown({"head": stated_readout(0.017)}) == {}
+    assert rolling_model(Film(0.02)).find_unknown_readouts({"head": stated_readout(0.017)}) == {}
 
 
 def test_a_readout_time_that_displaces_nothing_stays_unknown() -> None:
     film = Film(0.02)
     film.map_from_cam = np.repeat(film.map_from_cam[:1], FRAMES, axis=0)
-    readout = rolling_model(film).find_unknown({})["head"]
+    readout = rolling_model(film).find_unknown_readouts({})["head"]
     assert (readout.seconds, readout.determined) == (0.0, False)
 
 
@@ -171,7 +171,7 @@ def test_a_readout_time_that_displaces_nothing_stays_unknown() -> None:
 def test_a_turned_sensor_is_read_along_columns(readout_s: float) -> None:
     film = Film(readout_s, sideways=True)
     model = rolling_model(film).with_sideways({"head"})
-    reported = model.find_unknown({})["head"]
+    reported = model.find_unknown_readouts({})["head"]
     assert reported.source == ("estimated" if readout_s else "none found")
     assert abs(reported.seconds - readout_s) <= 0.1 * abs(readout_s)
     assert reported.sideways
@@ -302,7 +302,7 @@ def test_a_map_says_which_way_its_sensors_are_read() -> None:
 
 def test_a_camera_whose_frames_lie_in_another_map_is_left_alone() -> None:
     rolling = rolling_model(Film(0.02), posed=False)
-    assert rolling.find_unknown({}) == {}
+    assert rolling.find_unknown_readouts({}) == {}
     before, after = the_map(Film(0.02), range(1, FRAMES, 5)), rolling.corrected({"head": 0.02})
     for image_id in before.reg_image_ids():
         pairs = zip(before.image(image_id).points2D, after.image(image_id).points2D, strict=True)
