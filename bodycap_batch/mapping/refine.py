@@ -184,7 +184,6 @@ class _Refinement:
 
     def run(self) -> _Refined:
         """Return the model after the adjustment with the most exact motion."""
-        settings, calibrated_ids = self.mapping.mapper_options(), list(self.mapping.calibrated_ids)
         known = self._known_readouts()
         sideways = {name for name, readout in {**self.from_matches, **known}.items() if readout.sideways}
         sideways |= sideways_cameras(self.cameras, self.scene_map)
@@ -197,6 +196,7 @@ class _Refinement:
             return refined if is_corrected else self._unchanged(rolling, refined.readouts)
         model = rolling.with_exact_rates(readout_s, self.scene_map.readout_s.keys()).corrected(readout_s)
         removed = remove_dominant_points(model)
+        settings, calibrated_ids = self.mapping.mapper_options(), list(self.mapping.calibrated_ids)
         if self.mapping.is_large(model.num_reg_images()):
             adjust_in_two_steps(model, settings, calibrated_ids)
         else:

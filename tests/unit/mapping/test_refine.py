@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -76,6 +76,21 @@ def test_a_readout_time_that_matches_do_not_determine_is_unknown() -> None:
     unknown = judged_readout(0.003, 0.0027)
     assert refinement({"palm": 0.01}, {}, {"head": unknown})._known_readouts().keys() == {"palm"}
     assert refinement({"palm": 0.01}, {}, {})._known_readouts().keys() == {"palm"}
+
+
+@pytest.mark.parametrize(("of_map", "is_kept"), [({}, True), ({"palm": 0.01}, False)])
+def test_a_map_without_shutters_stays_as_it_is_if_its_adjustment_finds_none(
+    of_map: dict[str, float], is_kept: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fastest keyframes of the head show a rolling shutter, all keyframes together show none."""
+    none = judged_readout(0.0001, 0.0003)
+    refined = refinement(of_map, {}, {} if of_map else {"palm": none})
+    found = {} if of_map else {"head": judged_readout(0.005, 0.001)}
+    rolling = SimpleNamespace(with_sideways=lambda _: rolling, find_unknown_readouts=lambda *_: found)
+    refined = replace(refined, rolling=cast(Any, rolling), model=cast(Any, "before"))
+    adjusted = SimpleNamespace(readouts={"head": none, "palm": none}, model="after")
+    monkeypatch.setattr(_Refinement, "_with_velocities", lambda *_: adjusted)
+    assert refined.run().model == ("before" if is_kept else "after")
 
 
 def test_an_unknown_error_of_a_logged_readout_time_is_infinite() -> None:

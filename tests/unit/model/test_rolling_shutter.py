@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -81,23 +82,29 @@ class Film:
 
 def the_map(film: Film, keyframes: range) -> Any:
     """COLMAP's model of some frames: their pixels as seen, poses and points of the truth."""
+    return map_of({"head": film}, keyframes)
+
+
+def map_of(films: Mapping[str, Film], keyframes: range) -> Any:
+    """The same for several cameras, by name; each sees points of its own."""
     import pycolmap
 
     model = pycolmap.Reconstruction()
-    camera = LENS.to_pycolmap()
-    camera.camera_id = 1
-    model.add_camera_with_trivial_rig(camera)
-    tracks: dict[int, Any] = {}
-    for number, frame in enumerate(keyframes, start=1):
-        points, px = film.seen(frame)
-        image = pycolmap.Image(name=f"head/{frame:07d}", camera_id=1, image_id=number)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in px])
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(invert(film.map_from_cam[frame])[:3]))
-        for feature, point in enumerate(points.tolist()):
-            tracks.setdefault(point, pycolmap.Track()).add_element(number, feature)
-    for point, track in tracks.items():
-        if track.length() >= 2:
-            model.add_point3D(film.points[point], track)
+    for camera_id, (name, film) in enumerate(films.items(), start=1):
+        camera = LENS.to_pycolmap()
+        camera.camera_id = camera_id
+        model.add_camera_with_trivial_rig(camera)
+        tracks: dict[int, Any] = {}
+        for number, frame in enumerate(keyframes, start=1 + len(keyframes) * (camera_id - 1)):
+            points, px = film.seen(frame)
+            image = pycolmap.Image(name=f"{name}/{frame:07d}", camera_id=camera_id, image_id=number)
+            image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in px])
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(invert(film.map_from_cam[frame])[:3]))
+            for feature, point in enumerate(points.tolist()):
+                tracks.setdefault(point, pycolmap.Track()).add_element(number, feature)
+        for point, track in tracks.items():
+            if track.length() >= 2:
+                model.add_point3D(film.points[point], track)
     return model
 
 
@@ -165,6 +172,19 @@ def test_a_readout_time_that_displaces_nothing_stays_unknown() -> None:
     film.map_from_cam = np.repeat(film.map_from_cam[:1], FRAMES, axis=0)
     readout = rolling_model(film).find_unknown_readouts({})["head"]
     assert (readout.seconds, readout.determined) == (0.0, False)
+
+
+def test_a_camera_with_an_impossible_readout_time_costs_no_other_its_own() -> None:
+    # Rows of the torso are read for two frame intervals, which no sensor does.
+    films = {"head": Film(0.02), "torso": Film(2.0 * FRAME_S)}
+    rolling = RollingShutterModel(
+        map_of(films, range(1, FRAMES, 5)),
+        {name: replace(film.trajectory(), camera=name) for name, film in films.items()},
+        {name: camera_of(film) for name, film in films.items()},
+    )
+    readouts = rolling.find_unknown_readouts({})
+    assert abs(readouts["head"].seconds - 0.02) < 0.002
+    assert (readouts["torso"].seconds, readouts["torso"].determined) == (0.0, False)
 
 
 @pytest.mark.parametrize("readout_s", [0.02, -0.02, 0.0])
