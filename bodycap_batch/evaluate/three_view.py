@@ -159,7 +159,7 @@ def judge_legs(
 def _support(common: CommonRays, rotations: FloatArray, translations: FloatArray) -> int:
     """Return the number of grid cells with a point that follows given rotations and translations."""
     unit = translations / np.linalg.norm(translations)
-    values, _, depth = _linearised(common, rotations, unit)
+    values, _, depth = _linearised(common, _tangents(common), rotations, unit)
     return len(np.unique(common.cells[_follows(values, depth, common)]))
 
 
@@ -220,8 +220,9 @@ def _refined(common: CommonRays, rotations: FloatArray, translations: FloatArray
     Source: the elimination is variable projection in L. Kaufman's form, BIT 1975.
     """
     axis = translations.ravel() / np.linalg.norm(translations)
+    tangents = _tangents(common)
     for _ in range(_ITERATIONS):
-        values, jacobian, _ = _linearised(common, rotations, axis.reshape(2, 3))
+        values, jacobian, _ = _linearised(common, tangents, rotations, axis.reshape(2, 3))
         weights = 1.0 / (1.0 + np.sum(values**2, axis=1) / INLIER_PX**2)
         rows = (jacobian * weights[:, None, None]).reshape(-1, 12)
         normal = rows.T @ rows
@@ -234,7 +235,7 @@ def _refined(common: CommonRays, rotations: FloatArray, translations: FloatArray
         axis /= np.linalg.norm(axis)
         if np.linalg.norm(step) < _CONVERGED:
             break
-    values, jacobian, depth = _linearised(common, rotations, axis.reshape(2, 3))
+    values, jacobian, depth = _linearised(common, tangents, rotations, axis.reshape(2, 3))
     inliers = _follows(values, depth, common)
     noise_px = max(_MIN_NOISE_PX, 1.48 * float(np.median(np.abs(values[inliers])))) if inliers.any() else 1.0
     rows = jacobian[inliers].reshape(-1, 12)
@@ -251,15 +252,14 @@ def _refined(common: CommonRays, rotations: FloatArray, translations: FloatArray
 
 
 def _linearised(
-    common: CommonRays, rotations: FloatArray, translations: FloatArray
+    common: CommonRays, tangents: FloatArray, rotations: FloatArray, translations: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return residuals (M,4) in px, their Jacobian (M,4,12) and the inverse depths (M,).
 
     The parameters are both left rotation vectors and both translations. The derivative with the inverse
-    depth, which has its best value, is projected out of the Jacobian.
+    depth, which has its best value, is projected out of the Jacobian. The tangents are those of `_tangents`.
     """
     seen, count = common.rays[[0, 2]], len(common.noise_rad)
-    axes = _tangents(seen) / common.noise_rad[None, :, None, None]
     turned = common.rays[1] @ np.swapaxes(rotations, 1, 2)
     shift = translations[:, None] * common.elapsed[..., None]
     moved = cross(seen, shift)
@@ -268,8 +268,8 @@ def _linearised(
     point = turned + depth[None, :, None] * shift
     length = np.maximum(np.linalg.norm(point, axis=2), 1e-9)[..., None, None]
     ray = point[..., None, :] / length
-    value = np.sum(axes * ray, axis=-1, keepdims=True)
-    slope = (axes - value * ray) / length
+    value = np.sum(tangents * ray, axis=-1, keepdims=True)
+    slope = (tangents - value * ray) / length
     jacobian = np.zeros((count, 2, 2, 12))
     by_turn, by_shift = cross(turned[:, :, None], slope), slope * (depth * common.elapsed)[..., None, None]
     for view in range(2):
@@ -282,9 +282,10 @@ def _linearised(
     return np.swapaxes(value[..., 0], 0, 1).reshape(count, 4), flat, depth
 
 
-def _tangents(rays: FloatArray) -> FloatArray:
-    """Return two unit vectors (...,2,3) perpendicular to each unit vector (...,3)."""
+def _tangents(common: CommonRays) -> FloatArray:
+    """Return two vectors (2,M,2,3) perpendicular to each ray of the first and last picture, one px long."""
+    rays = common.rays[[0, 2]]
     helper = np.where(np.abs(rays[..., :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     one = cross(rays, helper)
     one /= np.linalg.norm(one, axis=-1, keepdims=True)
-    return np.stack([one, cross(rays, one)], axis=-2)
+    return np.asarray(np.stack([one, cross(rays, one)], axis=-2) / common.noise_rad[:, None, None])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.model.geometry import nearest_rotation, so3_exp
+from bodycap_batch.model.geometry import nearest_rotation
 
 _MAX_SIGMA_DEG = 5.0
 """Maximum standard deviation (degrees) of a measured rotation about any axis. A less exact measurement could
@@ -105,8 +105,8 @@ def measure_rotation(matches: RayMatches, expected: FloatArray | None = None) ->
 
 def residuals(matches: RayMatches, motion: Motion) -> tuple[FloatArray, BoolArray]:
     """Return the distances (M,) of matches from their epipolar lines, px, and which lie in front (M,)."""
-    residual, _, in_front = _epipolar(matches, motion.rotation, motion.direction)
-    return residual, in_front
+    residual, _ = _epipolar(matches, motion.rotation, motion.direction)
+    return residual, _may_lie_in_front(matches, motion.rotation, motion.direction)
 
 
 def usable(found: Motion) -> Motion | None:
@@ -157,25 +157,27 @@ def _turn_residual(matches: RayMatches, rotation: FloatArray) -> float:
 
 def refine_motion(matches: RayMatches, rotation: FloatArray, *, turn: bool = True) -> Motion:
     """Refine a rotation (if `turn`) and the direction of the translation by reweighted least squares."""
+    import cv2
+
     direction = _translation_direction(matches, rotation)
-    weights = np.ones(len(matches.first))
     for _ in range(_REFINEMENTS):
-        residual, jacobian, _ = _epipolar(matches, rotation, direction)
+        residual, jacobian = _epipolar(matches, rotation, direction)
         if not turn:
             jacobian[:, :3] = 0.0
         weights = 1.0 / (1.0 + (residual / INLIER_PX) ** 2) ** 2
-        normal = (jacobian * weights[:, None]).T @ jacobian
+        weighted = (jacobian * weights[:, None]).T
+        normal = weighted @ jacobian
         # A direction that pictures of a mere turn do not determine stays where it is.
         normal += (1e-9 + 1e-6 * np.trace(normal)) * np.eye(5)
-        step = -np.linalg.solve(normal, (jacobian * weights[:, None]).T @ residual)
-        rotation = so3_exp(step[:3]) @ rotation
+        step = -np.linalg.solve(normal, weighted @ residual)
+        rotation = cv2.Rodrigues(step[:3])[0] @ rotation
         direction = direction + tangents(direction) @ step[3:]
         direction /= np.linalg.norm(direction)
         if np.linalg.norm(step) < _CONVERGED_RAD:
             break
     rotation = nearest_rotation(rotation)
-    residual, jacobian, in_front = _epipolar(matches, rotation, direction)
-    inliers = (np.abs(residual) < INLIER_PX) & in_front
+    residual, jacobian = _epipolar(matches, rotation, direction)
+    inliers = (np.abs(residual) < INLIER_PX) & _may_lie_in_front(matches, rotation, direction)
     noise_px = (
         max(_MIN_NOISE_PX, 1.48 * float(np.median(np.abs(residual[inliers])))) if inliers.any() else 1.0
     )
@@ -222,15 +224,11 @@ def _parallax(turned: FloatArray, second: FloatArray, direction: FloatArray) -> 
 
 def cross(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return cross products of vectors (...,3). numpy's own function takes five times as long."""
-    a, b = np.broadcast_arrays(first, second)
-    return np.stack(
-        [
-            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
-            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
-            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
-        ],
-        axis=-1,
-    )
+    out = np.empty(np.broadcast_shapes(first.shape, second.shape))
+    for axis, (one, two) in enumerate(((1, 2), (2, 0), (0, 1))):
+        np.multiply(first[..., one], second[..., two], out=out[..., axis])
+        out[..., axis] -= first[..., two] * second[..., one]
+    return out
 
 
 def tangents(direction: FloatArray) -> FloatArray:
@@ -245,25 +243,32 @@ def tangents(direction: FloatArray) -> FloatArray:
     return np.array([[1.0 + sign * x * x * a, b], [sign * b, sign + y * y * a], [-sign * x, -y]])
 
 
-def _epipolar(
-    matches: RayMatches, rotation: FloatArray, direction: FloatArray
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return Sampson's residuals (M,) in px, their Jacobian (M,5), and which points may lie in front."""
+def _epipolar(matches: RayMatches, rotation: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return Sampson's residuals (M,) in px and their Jacobian (M,5).
+
+    With the turned first ray t, the second ray s and the direction d, the residual is s · (d × t) over the
+    length of its gradient in the tangent planes of both rays. The squares of the two parts of the gradient
+    are 1 - (t · d)² and 1 - (s · d)², each minus the square of the numerator.
+    """
+    turned, second = matches.first @ rotation.T, matches.second
+    normal = cross(turned, second)
+    value, along_first, along_second = normal @ direction, turned @ direction, second @ direction
+    squared = 2.0 * (1.0 - value**2) - along_first**2 - along_second**2
+    scale = np.maximum(np.sqrt(np.maximum(squared, 0.0)), 1e-3) * matches.noise_rad
+    jacobian = np.empty((len(turned), 5))
+    cosine = np.einsum("mi,mi->m", turned, second)
+    jacobian[:, :3] = second * along_first[:, None] - cosine[:, None] * direction
+    jacobian[:, 3:] = normal @ tangents(direction)
+    jacobian /= scale[:, None]
+    return value / scale, jacobian
+
+
+def _may_lie_in_front(matches: RayMatches, rotation: FloatArray, direction: FloatArray) -> BoolArray:
+    """Return True for the matches (M,) whose points may lie in front of both cameras."""
     turned = matches.first @ rotation.T
-    plane = cross(turned, direction)
-    # The residual is second · (direction × turned); its gradient in the tangent planes of both rays.
-    value = -np.einsum("mi,mi->m", matches.second, plane)
-    across_second = plane - matches.second * np.einsum("mi,mi->m", plane, matches.second)[:, None]
-    other = cross(matches.second, direction)
-    across_first = other - turned * np.einsum("mi,mi->m", other, turned)[:, None]
-    scale = np.sqrt(np.sum(across_second**2, axis=1) + np.sum(across_first**2, axis=1))
-    scale = np.maximum(scale, 1e-3) * matches.noise_rad
-    jacobian_rotation = cross(turned, other)
-    jacobian_direction = cross(turned, matches.second) @ tangents(direction)
     parallax = _parallax(turned, matches.second, direction)
-    in_front = parallax > -INLIER_PX * matches.noise_rad * np.linalg.norm(plane, axis=1)
-    jacobian = np.column_stack([jacobian_rotation, jacobian_direction]) / scale[:, None]
-    return value / scale, jacobian, in_front
+    across = np.linalg.norm(cross(turned, direction), axis=1)
+    return np.asarray(parallax > -INLIER_PX * matches.noise_rad * across)
 
 
 def _support_of(near: BoolArray, cells: IntArray) -> IntArray:
