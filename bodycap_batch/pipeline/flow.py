@@ -445,8 +445,8 @@ class Flow:
         if not given or not is_on(Mechanism.FREED_LENSES):
             return None
         self.runner.note(
-            f"{', '.join(given)}: the video contradicts the path with the given lens, so the paths are "
-            "computed once more with an unknown lens",
+            f"{', '.join(given)}: the video contradicts the path with the given lens; if the video "
+            "determines the lens, the paths are computed once more with that lens",
             "map",
         )
         out = copy.copy(self)
