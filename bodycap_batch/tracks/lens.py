@@ -540,10 +540,11 @@ def _residuals_px(poses: _Poses, rays: _Rays) -> tuple[FloatArray, FloatArray, F
     across = skew(translation)
     plane = turned @ across.swapaxes(1, 2)
     other = rays.second @ across @ rotation
-    squared = ((plane[:, :, :, None] * rays.by_second_px).sum(axis=2) ** 2).sum(axis=2)
-    squared += ((other[:, :, :, None] * rays.by_first_px).sum(axis=2) ** 2).sum(axis=2)
+    by_second = np.einsum("pki,pkij->pkj", plane, rays.by_second_px)
+    by_first = np.einsum("pki,pkij->pkj", other, rays.by_first_px)
+    squared = np.einsum("pkj,pkj->pk", by_second, by_second) + np.einsum("pkj,pkj->pk", by_first, by_first)
     size = np.sqrt(squared) + 1e-9
-    return (plane * rays.second).sum(axis=2) / size, turned, size
+    return np.einsum("pki,pki->pk", plane, rays.second) / size, turned, size
 
 
 @dataclass(frozen=True, slots=True)
