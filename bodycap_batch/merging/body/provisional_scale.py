@@ -116,7 +116,8 @@ def provisional_scale(
         raise ImplausibleBody(
             "the distances between the cameras are not possible for a person: the scale of "
             f"{scales[best]:.3g} m per map unit is out of bounds",
-            hint="check that the `mount` of each camera in the job is correct",
+            hint="check that the `mount` of each camera in the job is correct; if a camera on a wrist looks "
+            "at its hand, describe its place with `segment` and `joint_from_cam`",
         )
     return float(scales[best])
 
