@@ -40,7 +40,7 @@ from bodycap_batch.mapping.reconstruction.model_files import (
     write_models,
 )
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
-from bodycap_batch.mapping.validation.repair import remove_without_adjustment
+from bodycap_batch.mapping.validation.contradicted import remove_without_adjustment
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.scene import MapResult
 

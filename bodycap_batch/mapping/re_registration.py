@@ -14,12 +14,7 @@ if TYPE_CHECKING:
 
 
 def re_register_images(
-    model: pycolmap.Reconstruction,
-    image_ids: Collection[int],
-    context: MappingContext,
-    total: int,
-    *,
-    structure_less: bool = True,
+    model: pycolmap.Reconstruction, image_ids: Collection[int], context: MappingContext, total: int
 ) -> Any:
     """Remove some images from a model. Then register these images and all new images of the database.
 
@@ -28,7 +23,6 @@ def re_register_images(
         image_ids: Ids of the images to remove and to register again.
         context: Workspace, intrinsics, mapper options.
         total: Number of all keyframes, for the progress.
-        structure_less: Whether images that see no points of the map are registered from their matches.
 
     Returns:
         A copy of the model in which these images are registered, as far as they fit. All poses of the copy
@@ -36,7 +30,6 @@ def re_register_images(
     """
     rest = sub_model(model, set(model.reg_image_ids()) - set(image_ids))
     settings = context.mapper_options()
-    settings.structure_less_registration_fallback = structure_less
     extended = with_new_images(
         context.workspace,
         rest,

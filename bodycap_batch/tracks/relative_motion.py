@@ -243,7 +243,9 @@ def tangents(direction: FloatArray) -> FloatArray:
     return np.array([[1.0 + sign * x * x * a, b], [sign * b, sign + y * y * a], [-sign * x, -y]])
 
 
-def _epipolar(matches: RayMatches, rotation: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _epipolar(
+    matches: RayMatches, rotation: FloatArray, direction: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return Sampson's residuals (M,) in px and their Jacobian (M,5).
 
     With the turned first ray t, the second ray s and the direction d, the residual is s · (d × t) over the

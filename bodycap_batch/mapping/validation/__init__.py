@@ -1,1 +1,1 @@
-"""Checks and repairs of a map."""
+"""Checks of a map."""

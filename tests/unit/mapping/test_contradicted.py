@@ -1,9 +1,8 @@
-"""Misregistered keyframes are found through inconsistent pairs, and repaired."""
+"""Misregistered keyframes are found through inconsistent pairs, removed, and registered again."""
 
 from __future__ import annotations
 
 import copy
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -37,12 +36,12 @@ from bodycap_batch.mapping.reconstruction.initial_pair import find_user_pair, ra
 from bodycap_batch.mapping.reconstruction.mapper_options import make_mapper_options
 from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
 from bodycap_batch.mapping.results import finalise_models
+from bodycap_batch.mapping.validation.contradicted import remove_contradicted, remove_without_adjustment
 from bodycap_batch.mapping.validation.epipolar_consistency import (
     PairConsistency,
     evaluate_pairs,
     find_misregistered_images,
 )
-from bodycap_batch.mapping.validation.repair import remove_without_adjustment, repair_model
 from bodycap_batch.mapping.validation.second_registration import confirm_images
 from bodycap_batch.mapping.validation.track_agreement import (
     PairAgreement,
@@ -158,10 +157,10 @@ def test_an_empty_map_without_an_initial_pair_is_no_bug(tmp_path: Path) -> None:
     ("scale", "shift"),
     [(0.3, 0.0), (0.6, 0.0), (1.7, 0.0), (4.0, 0.0), (1.0, 0.1), (1.0, 0.3), (1.0, 0.6)],
 )
-def test_a_block_of_another_scale_or_place_is_found_and_repaired(
+def test_a_block_of_another_scale_or_place_is_removed_and_registered_again(
     scale: float, shift: float, built: tuple[Any, FloatArray, MappingContext, set[Any]]
 ) -> None:
-    model, poses, mapping, tried = built
+    model, poses, mapping, _ = built
     agreement = evaluate_agreement(mapping.workspace, model)
     assert find_misplaced_images(agreement, image_sequences(model)) == set()
     numbers = {ImageRef.parse(model.image(i).name).frame: int(i) for i in model.reg_image_ids()}
@@ -174,10 +173,11 @@ def test_a_block_of_another_scale_or_place_is_found_and_repaired(
     wrong = misplace(model, block, Similarity(scale, np.eye(3), offset))
     agreement = evaluate_agreement(mapping.workspace, wrong)
     assert find_misplaced_images(agreement, image_sequences(wrong)) == set(block)
-    mended, log = repair_model(wrong, tried, mapping)
+    kept, log = remove_contradicted(wrong, mapping)
+    assert log["cut"] == [f"cam/{frame:07d}" for frame in _MOVED]
+    mended = re_register_images(kept, [], mapping, KEYFRAMES)
     assert _rms(mended, poses) < 0.01
     assert mended.num_reg_images() == KEYFRAMES
-    assert log["cut"] == []
 
 
 def _with_blurred_block(model: Any, block: list[int]) -> Any:
@@ -329,51 +329,33 @@ def test_conjugate_gradients_give_the_same_map_as_the_direct_solver(
 
 
 def test_a_right_map_is_not_changed(built: tuple[Any, FloatArray, MappingContext, set[Any]]) -> None:
-    model, poses, mapping, pairs = built
+    model, poses, mapping, _ = built
     assert model.num_reg_images() == KEYFRAMES
     # Half a pixel at depth 4 and 420 px makes 5 mm for each point; a pose has dozens.
     assert _rms(model, poses) < 0.01
-    same, log = repair_model(model, set(pairs), mapping)
+    same, log = remove_contradicted(model, mapping)
     assert same is model
-    assert log == {"rounds": [], "cut": [], "contradicted_share": 0.0}
+    assert log == {"cut": [], "contradicted_share": 0.0}
+    assert remove_without_adjustment(model, mapping)[1] == []
 
 
-def test_a_misregistered_block_is_found_and_repaired(
+def test_a_misregistered_block_is_found_and_removed(
     built: tuple[Any, FloatArray, MappingContext, set[Any]],
 ) -> None:
-    model, poses, mapping, pairs = built
+    model, poses, mapping, _ = built
     ids = {ref.frame: number for ref, number in _ids(mapping).items()}
     wrong = _with_moved_block(model, ids)
     assert _rms(wrong, poses) > 0.1
     assert find_misregistered_images(evaluate_pairs(mapping.workspace, wrong)) == {
         ids[frame] for frame in _MOVED
     }
-    repaired, log = repair_model(wrong, set(pairs), mapping)
-    assert log["cut"] == []
-    assert repaired.num_reg_images() == KEYFRAMES
-    assert _rms(repaired, poses) < 0.01
-
-
-def test_keyframes_that_cannot_be_repaired_are_removed(
-    built: tuple[Any, FloatArray, MappingContext, set[Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    model, poses, mapping, pairs = built
-    wrong = _with_moved_block(model, {ref.frame: number for ref, number in _ids(mapping).items()})
-    # The mapper registers the block with the same wrong poses again.
-    module = sys.modules[re_register_images.__module__]
-    monkeypatch.setattr(module, "with_new_images", lambda *_, **__: pycolmap.Reconstruction(wrong))
-    adjusted: list[object] = []
-    monkeypatch.setattr(module, "adjust_and_filter", lambda model, *_: adjusted.append(model))
-    refs = sorted(_ids(mapping))
-    alone, names, _ = remove_without_adjustment(wrong, mapping)
-    assert names == [f"cam/{frame:07d}" for frame in _MOVED]
-    assert alone.num_reg_images() == KEYFRAMES - len(_MOVED)
-    assert remove_without_adjustment(model, mapping)[1] == []
-    cut, log = repair_model(wrong, pairs | {(a, b) for a in refs for b in refs if a < b}, mapping)
-    assert len(adjusted) == len(log["rounds"]), "the stage adjusts the model again at its end"
-    assert log["cut"] == [f"cam/{frame:07d}" for frame in _MOVED]
-    assert cut.num_reg_images() == KEYFRAMES - len(_MOVED)
-    assert _rms(cut, poses) < 0.01
+    names = [f"cam/{frame:07d}" for frame in _MOVED]
+    kept, log = remove_contradicted(wrong, mapping)
+    assert log["cut"] == names
+    assert log["contradicted_share"] > 0.0
+    for model_left in (kept, remove_without_adjustment(wrong, mapping)[0]):
+        assert model_left.num_reg_images() == KEYFRAMES - len(_MOVED)
+        assert _rms(model_left, poses) < 0.01
 
 
 def test_keyframes_are_registered_again_against_the_rest(
