@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import ImageRef
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import sub_model
@@ -18,7 +17,6 @@ from bodycap_batch.mapping.validation.epipolar_consistency import (
     find_misregistered_images,
     inconsistent_match_ratio,
 )
-from bodycap_batch.mapping.validation.second_registration import confirm_images
 from bodycap_batch.mapping.validation.track_agreement import (
     evaluate_agreement,
     find_misplaced_images,
@@ -28,15 +26,10 @@ from bodycap_batch.mapping.validation.track_agreement import (
 if TYPE_CHECKING:
     import pycolmap
 
-_CONFIRMED_ERROR_RATIO = 2.0
-"""Maximum error of a match that confirms the pose of a keyframe, as a multiple of the mapper's maximum
-reprojection error. Of 6, 8 and 12 px, all confirm the same keyframes within a few percent. Evidence:
-docs/decisions/mapping.md."""
-
 
 def remove_contradicted(
     model: pycolmap.Reconstruction, context: MappingContext
-) -> tuple[Any, dict[str, object]]:
+) -> tuple[Any, dict[str, Any]]:
     """Remove misregistered keyframes from a new model, as `remove_without_adjustment` does.
 
     The growth of the map registers them again, with further keyframes beside them. The model is not adjusted:
@@ -52,7 +45,7 @@ def remove_contradicted(
     }
     camera = find_contradicting_camera(pairs, cameras)
     kept, removed = _without_wrong(model, context, pairs)
-    entries: dict[str, object] = {
+    entries: dict[str, Any] = {
         "cut": removed,
         "contradicted_share": round(inconsistent_match_ratio(pairs), 4),
     }
@@ -86,46 +79,25 @@ def left_contradicted(removal: Mapping[str, Any], ratio: float) -> float:
     return float(removal["contradicted_share"]) if "contradicting_camera" in removal else ratio
 
 
-def find_wrong_images(
-    context: MappingContext, model: pycolmap.Reconstruction, pairs: Sequence[PairConsistency]
-) -> set[int]:
-    """Return the ids of the images whose pose or points contradict matches.
-
-    If no part of the model agrees with itself, only the images that contradict the poses are returned.
-
-    Args:
-        context: Workspace.
-        model: The model.
-        pairs: The verified pairs of the model (`evaluate_pairs`).
-    """
-    wrong = find_misregistered_images(pairs)
-    agreement = evaluate_agreement(context.workspace, model, context.times_ns)
-    misplaced = find_misplaced_images(agreement, image_sequences(model))
-    if model.num_reg_images() - len(wrong | misplaced) < MIN_MODEL_KEYFRAMES:
-        return wrong
-    return wrong | misplaced
-
-
 def _without_wrong(
     model: pycolmap.Reconstruction, context: MappingContext, pairs: Sequence[PairConsistency]
 ) -> tuple[Any, list[str]]:
     """Return the model without the images that contradict it, and the sorted names of these images.
 
-    An image stays if a second registration confirms its pose, unless the pose contradicts its matches. Points
-    that only the removed images observe are removed too. The poses of the removed frames are not lost:
-    registration (stage 3) estimates them later from the remaining points.
+    These are the images whose pose or points contradict matches. If no part of the model agrees with itself,
+    they are the images that contradict the poses alone. Points that only the removed images observe are
+    removed too. The poses of the removed frames are not lost: registration (stage 3) estimates them later
+    from the remaining points.
 
     Args:
         model: The model.
-        context: Workspace, mapper options.
+        context: Workspace.
         pairs: The verified pairs of the model.
     """
-    wrong = find_wrong_images(context, model, pairs)
-    if is_on(Mechanism.SECOND_REGISTRATION):
-        max_error_px = _CONFIRMED_ERROR_RATIO * context.mapper_options().mapper.filter_max_reproj_error
-        confirmed = confirm_images(context.workspace, model, wrong, image_sequences(model), max_error_px)
-        acquitted = confirmed - find_misregistered_images(pairs)
-        record_act(Mechanism.SECOND_REGISTRATION, len(acquitted))
-        wrong -= acquitted
+    wrong = find_misregistered_images(pairs)
+    agreement = evaluate_agreement(context.workspace, model, context.times_ns)
+    misplaced = find_misplaced_images(agreement, image_sequences(model))
+    if model.num_reg_images() - len(wrong | misplaced) >= MIN_MODEL_KEYFRAMES:
+        wrong |= misplaced
     removed = sorted(model.image(number).name for number in wrong)
     return sub_model(model, registered_ids(model) - wrong) if removed else model, removed

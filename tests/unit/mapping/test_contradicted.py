@@ -42,7 +42,6 @@ from bodycap_batch.mapping.validation.epipolar_consistency import (
     evaluate_pairs,
     find_misregistered_images,
 )
-from bodycap_batch.mapping.validation.second_registration import confirm_images
 from bodycap_batch.mapping.validation.track_agreement import (
     PairAgreement,
     evaluate_agreement,
@@ -178,64 +177,6 @@ def test_a_block_of_another_scale_or_place_is_removed_and_registered_again(
     mended = re_register_images(kept, [], mapping, KEYFRAMES)
     assert _rms(mended, poses) < 0.01
     assert mended.num_reg_images() == KEYFRAMES
-
-
-def _with_blurred_block(model: Any, block: list[int]) -> Any:
-    """Return a copy in which only every third feature of the images `block` still observes its point."""
-    out = copy.deepcopy(model)
-    for image_id in block:
-        for number, feature in enumerate(out.image(image_id).get_observation_point2D_idxs()):
-            if number % 3 and out.image(image_id).point2D(feature).has_point3D():
-                out.delete_observation(image_id, feature)
-    return out
-
-
-def test_a_correct_block_with_many_wrong_features_is_kept(
-    built: tuple[Any, FloatArray, MappingContext, set[Any]],
-) -> None:
-    model, poses, mapping, _ = built
-    numbers = {ImageRef.parse(model.image(i).name).frame: int(i) for i in model.reg_image_ids()}
-    block = [numbers[frame] for frame in _MOVED]
-    blurred = _with_blurred_block(model, block)
-    agreement = evaluate_agreement(mapping.workspace, blurred)
-    sequences = image_sequences(blurred)
-    assert find_misplaced_images(agreement, sequences) == set(block)
-    assert confirm_images(mapping.workspace, blurred, block, sequences, 8.0) == set(block)
-    assert confirm_images(mapping.workspace, blurred, block[:1], sequences, 8.0) == set()
-    kept, removed, _ = remove_without_adjustment(blurred, mapping)
-    assert removed == []
-    assert _rms(kept, poses) < 0.01
-
-
-@pytest.mark.parametrize(("scale", "shift"), [(0.3, 0.0), (1.7, 0.0), (4.0, 0.0), (1.0, 0.1), (1.0, 0.6)])
-def test_a_misplaced_block_is_not_confirmed(
-    scale: float, shift: float, built: tuple[Any, FloatArray, MappingContext, set[Any]]
-) -> None:
-    model, _, mapping, _ = built
-    numbers = {ImageRef.parse(model.image(i).name).frame: int(i) for i in model.reg_image_ids()}
-    found = np.array([model.image(numbers[frame]).projection_center() for frame in range(KEYFRAMES)])
-    block = [numbers[frame] for frame in _MOVED]
-    # Scaled about the keyframe before the block, each keyframe of the block moves.
-    start = found[_MOVED[0] - 1]
-    offset = (1.0 - scale) * start + np.array([0.0, 0.0, shift * np.linalg.norm(found[1] - found[0]) / 0.25])
-    wrong = misplace(model, block, Similarity(scale, np.eye(3), offset))
-    confirmed = confirm_images(mapping.workspace, wrong, block, image_sequences(wrong), 8.0)
-    assert confirmed == set()
-
-
-def test_without_points_no_image_is_confirmed(
-    built: tuple[Any, FloatArray, MappingContext, set[Any]],
-) -> None:
-    model, _, mapping, _ = built
-    empty = copy.deepcopy(model)
-    for point in list(empty.point3D_ids()):
-        empty.delete_point3D(point)
-    sequences = image_sequences(empty)
-    assert confirm_images(mapping.workspace, empty, sequences[0][:3], sequences, 8.0) == set()
-    # All images of the model are inconsistent: no image is left that determines points.
-    assert confirm_images(mapping.workspace, model, sequences[0], sequences, 8.0) == set()
-    # The only images that are left see nothing in common with the inconsistent ones.
-    assert confirm_images(mapping.workspace, model, sequences[0][:-1], sequences, 8.0) == set()
 
 
 def _without_points(model: Any) -> Any:
