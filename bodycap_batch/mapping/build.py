@@ -45,6 +45,7 @@ from bodycap_batch.mapping.matching.flipped_cameras import add_flip_hint, exclud
 from bodycap_batch.mapping.matching.keyframe_features import CameraKeyframes, add_keyframes
 from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_keyframes
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
+from bodycap_batch.mapping.re_registration import re_register_images
 from bodycap_batch.mapping.reconstruction.mapper_options import MIN_RESECTION_INLIERS
 from bodycap_batch.mapping.reconstruction.model_files import write_models
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
@@ -193,6 +194,9 @@ def build_map_once(
     log: dict[str, Any] = {"keyframes": len(refs), **match_log, **initial_log, **flips.to_log()}
     if models:
         models[0], log["first_removal"] = remove_contradicted(models[0], mapping)
+        if log["first_removal"]["cut"] and skeletal is generator:
+            # Without them, points that they bent are right, so most fit in their true place now.
+            models[0] = re_register_images(models[0], [], mapping, len(refs))
         resected: Sequence[set[int] | None] = [None] * len(models)
         if skeletal is not generator:
             resected, log["placed"] = resect_remaining(models, generator, tried, mapping)
