@@ -45,17 +45,16 @@ from bodycap_batch.mapping.matching.flipped_cameras import add_flip_hint, exclud
 from bodycap_batch.mapping.matching.keyframe_features import CameraKeyframes, add_keyframes
 from bodycap_batch.mapping.matching.pair_selection import PairGenerator, match_keyframes
 from bodycap_batch.mapping.matching.skeletal_set import SKELETAL_ABOVE
-from bodycap_batch.mapping.re_registration import re_register_images
 from bodycap_batch.mapping.reconstruction.mapper_options import MIN_RESECTION_INLIERS
 from bodycap_batch.mapping.reconstruction.model_files import write_models
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
-from bodycap_batch.mapping.validation.contradicted import (
-    left_contradicted,
-    remove_contradicted,
-    remove_without_adjustment,
-)
 from bodycap_batch.mapping.validation.epipolar_consistency import check_consistency, check_coverage
 from bodycap_batch.mapping.validation.remaining_keyframes import resect_remaining
+from bodycap_batch.mapping.validation.repair import (
+    left_contradicted,
+    remove_without_adjustment,
+    repair_model,
+)
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.rotation_path import TurningShutter
@@ -115,7 +114,7 @@ def build_map(
     try:
         return recalibrate_if_misfit(result, capture, build_again, refused)
     except EstimationError as error:
-        camera = result.diagnostics.details.get("first_removal", {}).get("contradicting_camera")
+        camera = result.diagnostics.details.get("repair", {}).get("contradicting_camera")
         if error is not refused or camera is None:
             raise
         without, unusable = build_map_once(
@@ -193,10 +192,8 @@ def build_map_once(
     models, initial_log = reconstruct_with_intrinsics(mapping, options, uncalibrated, len(skeletal.refs))
     log: dict[str, Any] = {"keyframes": len(refs), **match_log, **initial_log, **flips.to_log()}
     if models:
-        models[0], log["first_removal"] = remove_contradicted(models[0], mapping)
-        if log["first_removal"]["cut"] and skeletal is generator:
-            # Without them, points that they bent are right, so most fit in their true place now.
-            models[0] = re_register_images(models[0], [], mapping, len(refs))
+        total = len(refs) if skeletal is generator else None
+        models[0], log["repair"] = repair_model(models[0], mapping, total)
         resected: Sequence[set[int] | None] = [None] * len(models)
         if skeletal is not generator:
             resected, log["placed"] = resect_remaining(models, generator, tried, mapping)
@@ -213,7 +210,7 @@ def build_map_once(
     write_models(workspace, models)
     calibrated = {number: name for name, number in ids.items() if number in mapping.given_ids}
     misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
-    removed = [name for step in ("first_removal", "placed") if step in log for name in log[step]["cut"]]
+    removed = [name for step in ("repair", "placed") if step in log for name in log[step]["cut"]]
     misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
     if readouts:
         log["readouts_from_matches"] = {name: asdict(item) for name, item in sorted(readouts.items())}
@@ -224,9 +221,7 @@ def build_map_once(
     ).to_log()
     result = make_result(models, workspace, log)
     result = _with_readouts(result, {name: used[name] for name in shutters})
-    return result, refused or add_flip_hint(
-        check_consistency(left_contradicted(log["first_removal"], ratio)), flips
-    )
+    return result, refused or add_flip_hint(check_consistency(left_contradicted(log["repair"], ratio)), flips)
 
 
 def _with_readouts(result: MapResult, readouts: Mapping[str, Readout]) -> MapResult:

@@ -40,7 +40,7 @@ from bodycap_batch.mapping.reconstruction.model_files import (
     write_models,
 )
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
-from bodycap_batch.mapping.validation.contradicted import remove_without_adjustment
+from bodycap_batch.mapping.validation.repair import remove_without_adjustment
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.scene import MapResult
 
@@ -56,9 +56,9 @@ def extend_map(
 ) -> MapResult:
     """Add keyframes to a map.
 
-    First, the new keyframes are registered, and the existing poses do not change. Then misregistered
-    keyframes are removed. Last, all poses are adjusted. In a large map, only the poses of the keyframes in
-    `extra_frames` are adjusted.
+    First, the new keyframes are registered, and those of the database that the map lacks, for example removed
+    ones; the existing poses do not change. Then misregistered keyframes are removed. Last, all poses are
+    adjusted. In a large map, only the poses of the keyframes that were registered here are adjusted.
 
     Args:
         capture: All cameras.

@@ -27,7 +27,7 @@ from bodycap_batch.mapping.reconstruction.conversion import map_from_reconstruct
 from bodycap_batch.mapping.reconstruction.model_files import keyframe_names, model_order
 from bodycap_batch.mapping.reconstruction.reconstruct import reconstruct
 from bodycap_batch.mapping.results import finalise_models
-from bodycap_batch.mapping.validation.contradicted import remove_without_adjustment
+from bodycap_batch.mapping.validation.repair import remove_without_adjustment
 from bodycap_batch.model.scene import Map, MapResult, Trajectory
 
 

@@ -101,7 +101,7 @@ CAMERA_RULES = (
     ),
     Rule(
         name="Matches that contradict the map",
-        read=readings.at("mapping.first_removal.contradicted_share"),
+        read=readings.at("mapping.repair.contradicted_share"),
         bounds=Bounds(good=0.02),
         finding="{percent} of the matches between keyframes contradict the map",
         rationale="Matches of different places that look alike, of the wearer's body or of moving objects "

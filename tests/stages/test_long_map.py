@@ -84,15 +84,15 @@ def test_dark_keyframes_are_left_out(stroll_capture: Capture, tmp_path: Path) ->
 def test_a_skeletal_keyframe_that_was_removed_is_resected(
     stroll_capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    remove, removed = build.remove_contradicted, list[str]()
+    repair, removed = build.repair_model, list[str]()
 
     def cutting(*arguments: Any) -> tuple[Any, dict[str, object]]:
-        model, log = remove(*arguments)
+        model, log = repair(*arguments)
         number = sorted(model.reg_image_ids())[-1]
         removed.append(model.image(number).name)
         return sub_model(model, set(model.reg_image_ids()) - {number}), log
 
-    monkeypatch.setattr(build, "remove_contradicted", cutting)
+    monkeypatch.setattr(build, "repair_model", cutting)
     found = _built(stroll_capture, MapOptions(), context(tmp_path))
     log = found.log["placed"]
     assert log["carrying"] + log["placed"] == len(found.maps[0].keyframe_camera)

@@ -15,7 +15,7 @@ from bodycap_batch.mapping.matching.pair_selection import PairGenerator
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import adjust_and_filter, adjust_robustly
 from bodycap_batch.mapping.reconstruction.incremental_mapper import progress_counter, resect_images
 from bodycap_batch.mapping.reconstruction.model_files import model_order, registered_ids
-from bodycap_batch.mapping.validation.contradicted import remove_without_adjustment
+from bodycap_batch.mapping.validation.repair import remove_without_adjustment
 
 
 def resect_remaining(

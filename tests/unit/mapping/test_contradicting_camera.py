@@ -63,9 +63,7 @@ def _build(
     ) -> tuple[MapResult, EstimationError | None]:
         error = refused[len(calls)]
         calls.append(([item.camera for item in selections], options))
-        log = (
-            {"first_removal": {"contradicting_camera": "left_palm"}} if error is refused[0] and error else {}
-        )
+        log = {"repair": {"contradicting_camera": "left_palm"}} if error is refused[0] and error else {}
         return MapResult(maps=(small_map(),), workspace=folder, log=log), error
 
     monkeypatch.setattr(build, "build_map_once", build_once)

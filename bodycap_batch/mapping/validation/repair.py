@@ -1,4 +1,4 @@
-"""Find the keyframes that contradict a model, and remove them."""
+"""Repair a model: register keyframes that contradict it once more, and remove those that still do."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from bodycap_batch.mapping.mapping_context import MappingContext
 from bodycap_batch.mapping.matching.database import ImageRef
+from bodycap_batch.mapping.re_registration import re_register_images
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import sub_model
 from bodycap_batch.mapping.reconstruction.mapper_options import MIN_MODEL_KEYFRAMES
 from bodycap_batch.mapping.reconstruction.model_files import registered_ids
@@ -27,18 +28,27 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-def remove_contradicted(
-    model: pycolmap.Reconstruction, context: MappingContext
+def repair_model(
+    model: pycolmap.Reconstruction, context: MappingContext, total: int | None
 ) -> tuple[Any, dict[str, Any]]:
-    """Remove misregistered keyframes from a new model, as `remove_without_adjustment` does.
+    """Register misregistered keyframes once more, and remove those that still contradict the model.
 
-    The growth of the map registers them again, with further keyframes beside them. The model is not adjusted:
-    the stage adjusts it at its end (`finalise_models`).
+    Without them, the points that they bent are right, so most find their true place. The model is not
+    adjusted after the removal: the stage adjusts it at its end (`finalise_models`). Each growth of the map
+    tries the removed keyframes again.
+
+    Args:
+        model: The largest model; not changed.
+        context: Workspace, intrinsics, mapper options.
+        total: Number of all keyframes, for the progress; None to register none again.
 
     Returns:
-        The model without misregistered keyframes; entries for the log: the removed keyframes, the fraction of
-        matches in inconsistent pairs before the removal, and a camera that explains them.
+        The model; entries for the log: the keyframes that were registered again and those that were removed,
+        the fraction of matches in inconsistent pairs before the removal, and a camera that explains them.
     """
+    kept, doubtful, _ = remove_without_adjustment(model, context)
+    if doubtful and total is not None:
+        model = re_register_images(kept, [], context, total)
     pairs = evaluate_pairs(context.workspace, model, context.times_ns)
     cameras = {
         int(number): ImageRef.parse(model.image(number).name).camera for number in model.reg_image_ids()
@@ -46,6 +56,7 @@ def remove_contradicted(
     camera = find_contradicting_camera(pairs, cameras)
     kept, removed = _without_wrong(model, context, pairs)
     entries: dict[str, Any] = {
+        "doubtful": doubtful,
         "cut": removed,
         "contradicted_share": round(inconsistent_match_ratio(pairs), 4),
     }
@@ -72,7 +83,7 @@ def left_contradicted(removal: Mapping[str, Any], ratio: float) -> float:
     """Return the fraction of contradicting matches that decides whether a map is usable.
 
     Args:
-        removal: The log entries of `remove_contradicted`.
+        removal: The log entries of `repair_model`.
         ratio: The fraction that is left after all removals. If one camera explains the contradictions, the
             fraction before the removals decides: the map is then built without this camera.
     """
@@ -86,8 +97,7 @@ def _without_wrong(
 
     These are the images whose pose or points contradict matches. If no part of the model agrees with itself,
     they are the images that contradict the poses alone. Points that only the removed images observe are
-    removed too. The poses of the removed frames are not lost: registration (stage 3) estimates them later
-    from the remaining points.
+    removed too. Registration (stage 3) estimates the poses of single removed frames from the other points.
 
     Args:
         model: The model.
