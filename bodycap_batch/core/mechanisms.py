@@ -27,6 +27,8 @@ class Mechanism(StrEnum):
     SECOND_DETECTION = "second_detection"
     FLIPPED_CAMERAS = "flipped_cameras"
     SKELETAL_SET = "skeletal_set"
+    REPAIR = "repair"
+    SECOND_REGISTRATION = "second_registration"
     DOMINANT_POINTS = "dominant_points"
     TRANSIENT_POINTS = "transient_points"
     WEARER_POINTS = "wearer_points"

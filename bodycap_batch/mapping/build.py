@@ -50,11 +50,7 @@ from bodycap_batch.mapping.reconstruction.model_files import write_models
 from bodycap_batch.mapping.results import finalise_models, make_result, misplaced_frames
 from bodycap_batch.mapping.validation.epipolar_consistency import check_consistency, check_coverage
 from bodycap_batch.mapping.validation.remaining_keyframes import resect_remaining
-from bodycap_batch.mapping.validation.repair import (
-    left_contradicted,
-    remove_without_adjustment,
-    repair_model,
-)
+from bodycap_batch.mapping.validation.repair import left_contradicted, remove_without_adjustment, repair_model
 from bodycap_batch.mapping.validation.wearer_points import remove_points_on_wearer
 from bodycap_batch.model.map_diagnostics import MapDiagnostics
 from bodycap_batch.model.rotation_path import TurningShutter
@@ -192,8 +188,7 @@ def build_map_once(
     models, initial_log = reconstruct_with_intrinsics(mapping, options, uncalibrated, len(skeletal.refs))
     log: dict[str, Any] = {"keyframes": len(refs), **match_log, **initial_log, **flips.to_log()}
     if models:
-        total = len(refs) if skeletal is generator else None
-        models[0], log["repair"] = repair_model(models[0], mapping, total)
+        models[0], log["repair"] = repair_model(models[0], tried, mapping, skeletal.refs)
         resected: Sequence[set[int] | None] = [None] * len(models)
         if skeletal is not generator:
             resected, log["placed"] = resect_remaining(models, generator, tried, mapping)

@@ -1,4 +1,4 @@
-"""Register images again: the images removed from a model, and those of the database that it lacks."""
+"""Register images again: the images removed from a model, and the new images of the database."""
 
 from __future__ import annotations
 
@@ -14,15 +14,21 @@ if TYPE_CHECKING:
 
 
 def re_register_images(
-    model: pycolmap.Reconstruction, image_ids: Collection[int], context: MappingContext, total: int
+    model: pycolmap.Reconstruction,
+    image_ids: Collection[int],
+    context: MappingContext,
+    total: int,
+    *,
+    structure_less: bool = True,
 ) -> Any:
-    """Remove some images from a model. Then register all images of the database that it lacks.
+    """Remove some images from a model. Then register these images and all new images of the database.
 
     Args:
         model: A reconstruction; not changed.
         image_ids: Ids of the images to remove and to register again.
         context: Workspace, intrinsics, mapper options.
         total: Number of all keyframes, for the progress.
+        structure_less: Whether images that see no points of the map are registered from their matches.
 
     Returns:
         A copy of the model in which these images are registered, as far as they fit. All poses of the copy
@@ -30,6 +36,7 @@ def re_register_images(
     """
     rest = sub_model(model, set(model.reg_image_ids()) - set(image_ids))
     settings = context.mapper_options()
+    settings.structure_less_registration_fallback = structure_less
     extended = with_new_images(
         context.workspace,
         rest,

@@ -1,1 +1,1 @@
-"""Checks of a map."""
+"""Checks and repairs of a map."""

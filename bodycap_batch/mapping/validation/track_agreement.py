@@ -18,6 +18,7 @@ import numpy as np
 from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.mapping.matching.database import DATABASE_NAME, ImageRef
 from bodycap_batch.mapping.matching.near_pairs import NO_TIMES, NearPairs
+from bodycap_batch.mapping.validation.second_registration import observed_points
 
 if TYPE_CHECKING:
     import pycolmap
@@ -73,7 +74,7 @@ def evaluate_agreement(
     """
     import pycolmap
 
-    points = {int(number): _observed_points(model, int(number)) for number in model.reg_image_ids()}
+    points = {int(number): observed_points(model, int(number)) for number in model.reg_image_ids()}
     near = NearPairs(model, times_ns)
     out = []
     with pycolmap.Database.open(str(workspace / DATABASE_NAME)) as database:
@@ -264,12 +265,3 @@ def _largest_connected(partners: Mapping[int, Mapping[int, PairAgreement]], rema
         best = max(best, part, key=len)
         remaining = remaining - part
     return best
-
-
-def _observed_points(model: pycolmap.Reconstruction, image_id: int) -> IntArray:
-    """Return the id (N,) of the point that each feature of an image observes; −1 without a point."""
-    image = model.image(image_id)
-    out = np.full(image.num_points2D(), -1, dtype=np.int64)
-    for feature in image.get_observation_point2D_idxs():
-        out[feature] = image.point2D(feature).point3D_id
-    return out

@@ -27,19 +27,19 @@ def test_the_environment_names_what_is_off_in_a_process_without_a_task(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(mechanisms._task, "off", None)
-    monkeypatch.setenv(mechanisms.VARIABLE, "skeletal_set, extension")
-    assert mechanisms.switched_off() == {Mechanism.SKELETAL_SET, Mechanism.EXTENSION}
-    assert not mechanisms.is_on(Mechanism.EXTENSION)
+    monkeypatch.setenv(mechanisms.VARIABLE, "skeletal_set, repair")
+    assert mechanisms.switched_off() == {Mechanism.SKELETAL_SET, Mechanism.REPAIR}
+    assert not mechanisms.is_on(Mechanism.REPAIR)
     assert mechanisms.is_on(Mechanism.RECOVERY)
 
 
 def test_a_task_uses_the_switches_of_its_key_and_counts_from_zero(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(mechanisms.VARIABLE, "extension")
+    monkeypatch.setenv(mechanisms.VARIABLE, "repair")
     mechanisms.begin_task({mechanisms.KEY_OPTION: ["skeletal_set"], "features": 512})
     assert mechanisms.switched_off() == {Mechanism.SKELETAL_SET}
-    mechanisms.record_act(Mechanism.EXTENSION, 2)
+    mechanisms.record_act(Mechanism.REPAIR, 2)
     mechanisms.record_act(Mechanism.RECOVERY, 0)
-    assert mechanisms.acted() == {"extension": 2}
+    assert mechanisms.acted() == {"repair": 2}
     mechanisms.begin_task({})
     assert mechanisms.switched_off() == frozenset()
     assert mechanisms.acted() == {}
