@@ -283,7 +283,10 @@ def _linearised(
 
 
 def _tangents(common: CommonRays) -> FloatArray:
-    """Return two vectors (2,M,2,3) perpendicular to each ray of both outer pictures, per px of noise."""
+    """Return two vectors (2,M,2,3) perpendicular to each ray of the first and the last picture.
+
+    Their length is 1 / noise_rad, so that their products with other rays are errors in px.
+    """
     rays = common.rays[[0, 2]]
     helper = np.where(np.abs(rays[..., :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     one = cross(rays, helper)
