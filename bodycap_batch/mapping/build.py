@@ -188,7 +188,8 @@ def build_map_once(
     models, initial_log = reconstruct_with_intrinsics(mapping, options, uncalibrated, len(skeletal.refs))
     log: dict[str, Any] = {"keyframes": len(refs), **match_log, **initial_log, **flips.to_log()}
     if models:
-        models[0], log["repair"] = repair_model(models[0], tried, mapping, skeletal.refs)
+        total = len(refs) if skeletal is generator else None
+        models[0], log["repair"] = repair_model(models[0], mapping, total)
         resected: Sequence[set[int] | None] = [None] * len(models)
         if skeletal is not generator:
             resected, log["placed"] = resect_remaining(models, generator, tried, mapping)

@@ -56,9 +56,9 @@ def extend_map(
 ) -> MapResult:
     """Add keyframes to a map.
 
-    First, the new keyframes are registered, and the existing poses do not change. Then misregistered
-    keyframes are removed. Last, all poses are adjusted. In a large map, only the poses of the keyframes in
-    `extra_frames` are adjusted.
+    First, the new keyframes are registered, and those of the database that the map lacks, for example removed
+    ones; the existing poses do not change. Then misregistered keyframes are removed. Last, all poses are
+    adjusted. In a large map, only the poses of the keyframes that were registered here are adjusted.
 
     Args:
         capture: All cameras.

@@ -1,4 +1,4 @@
-"""Register images again: the images removed from a model, and the new images of the database."""
+"""Register images again: the images removed from a model, and those of the database that it lacks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def re_register_images(
     *,
     structure_less: bool = True,
 ) -> Any:
-    """Remove some images from a model. Then register these images and all new images of the database.
+    """Remove some images from a model. Then register all images of the database that it lacks.
 
     Args:
         model: A reconstruction; not changed.

@@ -182,3 +182,29 @@ def test_a_large_map_is_extended_without_global_adjustments(
     assert len(grown.maps[0].keyframe_camera) == len(result.maps[0].keyframe_camera) + 3
     assert adjusted == [3]
     assert _position_errors(grown).max() < 0.03
+
+
+def test_a_growth_registers_removed_keyframes_again(
+    stroll_capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    repair = build.repair_model
+
+    def cutting(*arguments: Any) -> tuple[Any, dict[str, object]]:
+        model, log = repair(*arguments)
+        number = sorted(model.reg_image_ids())[-1]
+        kept = sub_model(model, set(model.reg_image_ids()) - {number})
+        return kept, {**log, "cut": [model.image(number).name]}
+
+    monkeypatch.setattr(build, "repair_model", cutting)
+    first, second = tmp_path / "first", tmp_path / "second"
+    first.mkdir()
+    second.mkdir()
+    frames = list(range(0, FRAMES, 4))
+    found = _built(stroll_capture, MapOptions(), context(first), frames)
+    ((camera, removed),) = found.diagnostics.misplaced.items()
+    extra = {camera: np.array([next(frame + 1 for frame in frames if frame not in DARK)])}
+    grown = extend_map(stroll_capture, found, extra, MapOptions(), context(second), skeletal_above=40)
+    inside = zip(grown.maps[0].keyframe_camera, grown.maps[0].keyframe_frame.tolist(), strict=True)
+    assert (camera, *removed) in set(inside)
+    assert not grown.diagnostics.misplaced
+    assert _position_errors(grown).max() < 0.03
