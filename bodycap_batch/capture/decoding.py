@@ -53,10 +53,11 @@ def decode_frames(
         for index in map(int, indices):
             frame = frame_decoder.advance(index)
             if frame is None and not frame_decoder.sequential:
-                # Seeking does not work well in some containers (MPEG program streams). Then all frames are
-                # decoded from the start of the video.
+                # Seeking does not work well in some containers (MPEG program streams), and an error in one
+                # frame loses others that several threads decode at the same time. Then all frames are decoded
+                # from the start of the video in one thread.
                 frame_decoder.close()
-                frame_decoder = _ForwardDecoder(video, None, threads)
+                frame_decoder = _ForwardDecoder(video, None, 1)
                 frame = frame_decoder.advance(index)
             if frame is not None:
                 yield index, frame
@@ -72,10 +73,11 @@ def decode_frames(
         frame_decoder.close()
 
 
-def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
+def first_frame(video: VideoFile) -> tuple[VideoFrame, bool]:
     """Decode the first frame that can be decoded and that has a timestamp.
 
-    If no frame has a timestamp, the first frame that can be decoded is returned.
+    If no frame has a timestamp, the first frame that can be decoded is returned. With several threads, an
+    error in the second frame would lose the first one.
 
     Returns:
         The frame, and a flag: True if the codec stores the frames in an order different from the order in
@@ -87,7 +89,7 @@ def first_frame(video: VideoFile, threads: int = 0) -> tuple[VideoFrame, bool]:
     import av
 
     with open_container(video.path, video.part) as container:
-        stream = open_stream(container, video, threads)
+        stream = open_stream(container, video, 1)
         first: VideoFrame | None = None
         try:
             for packet in container.demux(stream):

@@ -43,25 +43,23 @@ _NO_ZERO = 0x200
 FFmpeg's AVFMT_TS_DISCONT."""
 
 
-def index_videos(paths: Iterable[Path], threads: int = 0) -> tuple[VideoFile, ...]:
+def index_videos(paths: Iterable[Path]) -> tuple[VideoFile, ...]:
     """List the frames of the chapters of a camera. A file of several recordings gives several chapters.
 
     Args:
         paths: Paths of the video files.
-        threads: Number of threads of the decoder, as in `open_stream`.
 
     Raises:
         CaptureError: A file cannot be used: see `index_video`.
     """
-    return tuple(index_video(path, threads, part) for path in paths for part in parts_of(path))
+    return tuple(index_video(path, part) for path in paths for part in parts_of(path))
 
 
-def index_video(path: Path, threads: int = 0, part: tuple[int, int] | None = None) -> VideoFile:
+def index_video(path: Path, part: tuple[int, int] | None = None) -> VideoFile:
     """List the frames of a video. Only one frame is decoded, to read its size and orientation.
 
     Args:
         path: Path of the video file.
-        threads: Number of threads of the decoder, as in `open_stream`.
         part: First byte, and the byte after the last byte, of the recording in the file; None for all bytes.
 
     A video whose end is missing is used up to its last whole frame, unless an index of the whole file shows
@@ -111,7 +109,7 @@ def index_video(path: Path, threads: int = 0, part: tuple[int, int] | None = Non
         sound_s=sound_s,
         part=part,
     )
-    return _with_lost_frames(_with_first_frame(video, container_format, threads), packets.lost)
+    return _with_lost_frames(_with_first_frame(video, container_format), packets.lost)
 
 
 def _scan_packets(
@@ -219,14 +217,14 @@ def _with_lost_frames(video: VideoFile, lost: int) -> VideoFile:
     return replace(video, notes=(*video.notes, text))
 
 
-def _with_first_frame(video: VideoFile, container_format: str, threads: int) -> VideoFile:
+def _with_first_frame(video: VideoFile, container_format: str) -> VideoFile:
     """Return the video with size and orientation taken from a decoded frame.
 
     The values in the container may be wrong. Frames before the first frame that can be decoded are removed
     from the list. Such frames exist if the stream was cut between two key frames. If no decoded frame has a
     timestamp, no frame is removed.
     """
-    frame, reordered = first_frame(video, threads)
+    frame, reordered = first_frame(video)
     video = replace(
         video,
         stored_size=(frame.width, frame.height),

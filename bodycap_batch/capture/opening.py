@@ -49,7 +49,7 @@ def open_camera(spec: CaptureConfig, config: CameraConfig, threads: int = 0) -> 
         CaptureError: A video of the camera, its timestamps or its calibration cannot be used, or there is no
             frame between start_s and end_s.
     """
-    videos = index_videos(config.video, threads)
+    videos = index_videos(config.video)
     for video in videos:
         if video.projection:
             raise spherical_error(video.path, video.projection)

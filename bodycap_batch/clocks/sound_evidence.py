@@ -156,7 +156,7 @@ def _offset_through(
 
 
 def _read_recording(config: CameraConfig) -> tuple[Recording, SoundTrack]:
-    videos = index_videos(config.video, 1)
+    videos = index_videos(config.video)
     times_ns = join_chapters(videos, config.timestamps).times_ns
     track = read_sound_track(config.name, videos, times_ns)
     first_frame_s = int(times_ns[0]) / 1e9
@@ -176,7 +176,7 @@ def _read_recording(config: CameraConfig) -> tuple[Recording, SoundTrack]:
 
 def _read_channels(camera: tuple[CameraConfig, SoundTrack]) -> list[SoundTrack]:
     config, mix = camera
-    videos = index_videos(config.video, 1)
+    videos = index_videos(config.video)
     return read_channels(mix, videos, join_chapters(videos, config.timestamps).times_ns)
 
 

@@ -33,12 +33,12 @@ def noise() -> list[Image]:
     return [rng.integers(0, 255, (48, 64), dtype=np.uint8) for _ in range(COUNT)]
 
 
-def pictures(video: VideoFile, indices: Sequence[int] | None = None) -> dict[int, bytes]:
+def pictures(video: VideoFile, indices: Sequence[int] | None = None, threads: int = 1) -> dict[int, bytes]:
     """Decode frames as a run does; leave out those that the decoder reports as damaged."""
     wanted = np.arange(len(video.pts)) if indices is None else np.array(indices)
     return {
         int(video.pts[index]): frame.to_ndarray().tobytes()
-        for index, frame in decode_frames(video, wanted, 1, skip_lost=True)
+        for index, frame in decode_frames(video, wanted, threads, skip_lost=True)
         if not frame.is_corrupt
     }
 
@@ -93,6 +93,7 @@ def test_a_file_in_fragments_is_used_up_to_its_last_whole_frame(
         assert ("end is missing" in video.missing_end) or data[cut + 4 : cut + 8] in (b"moof", b"mfra"), cut
         far = [0, count - 1] if count > 1 else [0]
         assert pictures(video, far) == {int(video.pts[i]): found[int(video.pts[i])] for i in far}
+        assert pictures(video, threads=4) == found
 
 
 @pytest.mark.parametrize(

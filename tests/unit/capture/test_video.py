@@ -72,7 +72,7 @@ def test_a_missing_timestamp_of_the_first_decoded_frame_removes_no_later_frame(
     context = SimpleNamespace(has_b_frames=0)
     codec = SimpleNamespace(codec_context=context, decode=lambda packet: [packet])
     monkeypatch.setattr(decoding, "open_stream", lambda *_: codec)
-    found = frame_index._with_first_frame(negative, "matroska", 0)
+    found = frame_index._with_first_frame(negative, "matroska")
     assert found.pts.tolist() == negative.pts[unknown % 10 :].tolist()
 
 
