@@ -412,9 +412,10 @@ def _render_patches(
         if len(own) == 0:
             continue
         sample, own_offset = centres[own].astype(np.float32), offset[own]
-        # One array for each axis, as OpenCV needs them.
+        # One array for each axis, as OpenCV needs them, and one row for each patch: OpenCV takes 32,766 rows.
         column, row = (
-            (sample[:, :, None, axis] + own_offset[:, None, :, axis]).reshape(-1, side) for axis in (0, 1)
+            (sample[:, :, None, axis] + own_offset[:, None, :, axis]).reshape(-1, side * side)
+            for axis in (0, 1)
         )
         rendered = cv2.remap(source.levels[level.pyramid_level], column, row, cv2.INTER_LINEAR)
         images[own] = rendered.reshape(len(own), samples, side, side).mean(axis=1, dtype=np.float32)
