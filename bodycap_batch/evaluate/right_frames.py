@@ -19,17 +19,15 @@ from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.evaluate.breaks import contradicted_times, scale_jumps
 from bodycap_batch.evaluate.fresh_features import FrameFeatures, match_features
 from bodycap_batch.evaluate.three_view import CommonRays, Legs, judge_legs, measure_legs
-from bodycap_batch.evaluate.two_view import Outcome, differs, judge_rotation
-from bodycap_batch.model.geometry import rotation_angle_rad, so3_exp, so3_log
+from bodycap_batch.evaluate.two_view import WRONG_DEG, Outcome, judge_rotation
+from bodycap_batch.model.geometry import so3_exp, so3_log
 from bodycap_batch.model.rotation_chain import RotationChain
 from bodycap_batch.tracks.relative_motion import Motion, RayMatches, measure_rotation
 
 GAPS = {1: 1, 5: 1, 15: 3, 45: 3}
 """Distances in frames of the linked frames, and every how many frames a link starts."""
-_LENS_ERROR = 0.02
-"""Relative error of a turned angle through an error of the focal length. Evidence: none."""
 _MAX_CHAIN_SIGMA_DEG = 5.0
-"""Maximum standard deviation (degrees) of a chain of rotations across lost frames."""
+"""Maximum standard deviation (degrees) of a turn across lost frames that confirms a path."""
 _MAX_READOUT_TURN_DEG = 2.0
 """Maximum turn (degrees) during the readout of a frame whose points are used for positions. Evidence:
 docs/decisions/report.md."""
@@ -41,13 +39,8 @@ _FIXED_SHARE = 0.2
 """Maximum displacement of a match that is fixed to the camera, as a share of that of the room. Evidence: the
 hand beside a wrist camera gave wrong legs in 25 of 38 triples of a path whose rotations agree in 365 of 367
 pairs."""
-_STEPS = (5, 3, 2, 1)
-"""Distances in frames that one step of a chain may have, in the order in which they are tried. Between near
-frames the pictures hardly distinguish a turn from a step to the side, and all errors have the same sign."""
-
-
 _MIN_WRONG_LINKS = 2
-"""Minimum number of wrong rotations across a break, beyond the right ones. A chain across lost frames counts
+"""Minimum number of wrong rotations across a break, beyond the right ones. The turn across lost frames counts
 twice: it is made of many pairs, and only one spans some gaps."""
 _MIN_WRONG_LEGS = 3
 """Minimum number of wrong triples across a break, beyond the right ones. Two triples of neighbouring frames
@@ -114,8 +107,7 @@ class Pictures:
             features: The features of each frame.
             times_s: (N,) times of the frames; needed only for a rolling shutter.
             readout_s: Time from the exposure of the first row to that of the last row.
-            rotation_chain: How the camera turns, by tracks. It finds folds across pictures that are too
-                blurred for features.
+            rotation_chain: How the camera turns, by tracks. Only it finds folds across lost frames.
             rotations: (N,3,3) delivered rotations, NaN for a frame without a pose. They correct a rolling
                 shutter, and a pair that they fit needs no search, which makes the measurement three times as
                 fast. None for measurements that do not depend on the poses.
@@ -291,15 +283,16 @@ def _judge_pair(pictures: Pictures, frames: tuple[int, int], world_from_cam: Flo
     return judge_rotation(_ray_matches(first, second, pair.rows), pair.measured, expected)
 
 
-def _judge_chain(pictures: Pictures, frames: tuple[int, int], world_from_cam: FloatArray) -> Outcome:
-    """Compare the delivered rotation across lost frames with the rotations between them, or with tracks."""
-    chain, by_tracks = _chain(pictures, *frames), pictures.rotation_chain
-    rotations = world_from_cam[list(frames), :3, :3]
-    if chain is not None:
-        return Outcome.WRONG if differs(*chain, rotations[1].T @ rotations[0]) else Outcome.RIGHT
-    if by_tracks is not None and by_tracks.confirms(np.array(frames), rotations) is False:
+def _judge_gap(pictures: Pictures, frames: tuple[int, int], world_from_cam: FloatArray) -> Outcome:
+    """Compare the delivered rotation across lost frames with the turn that the tracks show."""
+    chain = pictures.rotation_chain
+    found = None if chain is None else chain.compare(*frames, world_from_cam[list(frames), :3, :3])
+    if found is None:
+        return Outcome.UNMEASURABLE
+    if found.is_wrong(np.deg2rad(WRONG_DEG)):
         return Outcome.WRONG
-    return Outcome.UNMEASURABLE
+    is_exact = found.sigma_rad < np.deg2rad(_MAX_CHAIN_SIGMA_DEG)
+    return Outcome.RIGHT if is_exact else Outcome.UNMEASURABLE
 
 
 def find_right_frames(
@@ -326,16 +319,16 @@ def find_right_frames(
             if first % every == 0 and second < count and posed[first] and posed[second]:
                 links_of[first, second] = _judge_pair(pictures, (first, second), world_from_cam)
     ends = pairwise(np.flatnonzero(posed).tolist())
-    chains_of = {(a, b): _judge_chain(pictures, (a, b), world_from_cam) for a, b in ends if b - a > 1}
+    gaps_of = {(a, b): _judge_gap(pictures, (a, b), world_from_cam) for a, b in ends if b - a > 1}
     legs = _position_outcomes(pictures, list(links_of), world_from_cam)
-    outcomes = links_of | chains_of
+    outcomes = links_of | gaps_of
     outcomes |= _revisits(pictures, world_from_cam, posed)
     spans: dict[Outcome, list[tuple[int, int]]] = defaultdict(list)
     for frames, (outcome, _) in legs.items():
         spans[outcome].append((frames[0], frames[2]))
     links = {each: [pair for pair, found in outcomes.items() if found is each] for each in Outcome}
-    chains = {each: [pair for pair in chains_of if outcomes[pair] is each] for each in Outcome}
-    across = {each: links[each] + chains[each] for each in Outcome}
+    twice = {each: [pair for pair in gaps_of if outcomes[pair] is each] for each in Outcome}
+    across = {each: links[each] + twice[each] for each in Outcome}
     folds = contradicted_times(across[Outcome.WRONG], across[Outcome.RIGHT], count, _MIN_WRONG_LINKS)
     unexplained = [span for span in spans[Outcome.WRONG] if not _spans(span, folds)]
     leaps = contradicted_times(unexplained, spans[Outcome.RIGHT], count, _MIN_WRONG_LEGS)
@@ -411,27 +404,6 @@ def _measure_triple(
         elapsed=elapsed,
     )
     return MeasuredTriple(common=common, measured=measure_legs(common, (before.measured, after.measured)))
-
-
-def _chain(pictures: Pictures, first: int, last: int) -> tuple[FloatArray, FloatArray] | None:
-    """Return the rotation last_from_first through the frames between, and its covariance, if it is exact."""
-    rotation, sigma, turned = np.eye(3), 0.0, 0.0
-    index = first
-    while index < last:
-        steps = (min(index + step, last) for step in _STEPS)
-        tried = ((end, pictures.pair(index, end).measured) for end in steps)
-        end, measured = next((pair for pair in tried if pair[1] is not None), (index, None))
-        if measured is None:
-            return None
-        turn = measured.rotation
-        rotation = turn @ rotation
-        # The errors of the steps have a common part, so their standard deviations are added.
-        sigma += np.deg2rad(measured.sigma_deg)
-        turned += float(rotation_angle_rad(turn))
-        index = end
-    variance = sigma**2 + (_LENS_ERROR * turned) ** 2
-    is_exact = variance < np.deg2rad(_MAX_CHAIN_SIGMA_DEG) ** 2
-    return (rotation, variance * np.eye(3)) if is_exact else None
 
 
 def _revisits(

@@ -18,6 +18,23 @@ _MIN_SIGMAS = 5.0
 Evidence: docs/decisions/tracks.md."""
 
 
+@dataclass(frozen=True, slots=True)
+class TurnError:
+    """The difference between two turns of a camera.
+
+    Attributes:
+        angle_rad: The angle between them.
+        sigma_rad: Its standard deviation.
+    """
+
+    angle_rad: float
+    sigma_rad: float
+
+    def is_wrong(self, min_angle_rad: float) -> bool:
+        """Return True if the difference is larger than this angle, and more than its deviation explains."""
+        return bool(self.angle_rad > max(min_angle_rad, _MIN_SIGMAS * self.sigma_rad))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RotationChain:
     """Rotations of a camera between successive frames.
@@ -67,14 +84,18 @@ class RotationChain:
             rotation = turn @ rotation
         return rotation, sigma
 
-    def confirms(self, frames: IntArray, world_from_cam: FloatArray) -> bool | None:
-        """Return whether the rotations (2,3,3) of two frames (2,) agree with the chain; None if unknown."""
-        found = self.between(int(frames[0]), int(frames[1]))
+    def compare(self, first: int, last: int, world_from_cam: FloatArray) -> TurnError | None:
+        """Compare the rotations (2,3,3) of two frames with the chain; None if it does not know the turn."""
+        found = self.between(first, last)
         if found is None:
             return None
-        rotation, sigma = found
-        error = float(np.linalg.norm(so3_log(world_from_cam[1].T @ world_from_cam[0] @ rotation.T)))
-        return error <= max(MIN_ANGLE_RAD, _MIN_SIGMAS * sigma)
+        error = so3_log(world_from_cam[1].T @ world_from_cam[0] @ found[0].T)
+        return TurnError(angle_rad=float(np.linalg.norm(error)), sigma_rad=found[1])
+
+    def confirms(self, frames: IntArray, world_from_cam: FloatArray) -> bool | None:
+        """Return whether the rotations (2,3,3) of two frames (2,) agree with the chain; None if unknown."""
+        found = self.compare(int(frames[0]), int(frames[1]), world_from_cam)
+        return None if found is None else not found.is_wrong(MIN_ANGLE_RAD)
 
 
 def find_folded(chain: RotationChain | None, frames: IntArray, world_from_cam: FloatArray) -> BoolArray:

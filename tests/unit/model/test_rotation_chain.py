@@ -82,6 +82,21 @@ def test_a_part_that_is_folded_is_found(start: int, stop: int, lost: int) -> Non
     assert not find_folded(chain, frames, rotations[frames]).any()
 
 
+@pytest.mark.parametrize(("sigma_deg", "is_wrong"), [(0.1, True), (1.0, False)])
+def test_a_turn_is_wrong_only_beyond_its_own_deviation(sigma_deg: float, is_wrong: bool) -> None:
+    rotations = path()
+    turned = so3_exp(np.array([[0.0, np.deg2rad(8.0), 0.0]]))[0]
+    found = chain_of(rotations, np.arange(FRAMES), sigma_deg).compare(
+        10, 14, np.stack([rotations[10], rotations[14] @ turned])
+    )
+    assert found is not None
+    assert found.angle_rad == pytest.approx(np.deg2rad(8.0), rel=1e-3)
+    # Four links, and 2 % of a turn of 8 degrees.
+    assert found.sigma_rad == pytest.approx(np.deg2rad(np.hypot(4 * sigma_deg, 0.16)), rel=0.05)
+    assert found.is_wrong(np.deg2rad(5.0)) is is_wrong
+    assert not found.is_wrong(np.deg2rad(9.0))
+
+
 def test_an_inexact_chain_contradicts_nothing() -> None:
     rotations = path()
     chain = chain_of(rotations, np.arange(0, FRAMES, 5), sigma_deg=20.0)
