@@ -253,7 +253,7 @@ CASES = {
 """Reader, inputs, and their number in ``make fuzz``: 52,000 in all, chosen by the cost of one input."""
 FRACTION_VARIABLE = "BODYCAP_FUZZ_SHARE"
 """Environment variable with the fraction of these inputs that the slow tests take."""
-DEFAULT_FRACTION = "0.2"
+DEFAULT_FRACTION = "0.1"
 
 
 def run(name: str, count: int) -> None:
