@@ -44,8 +44,8 @@ test-slow: $(VENV)/.dev ## run the slow tests and those on real captures
 	$(SLOW) -m "slow or data" --durations=20 $(ARGS)
 
 .PHONY: fuzz
-fuzz: $(VENV)/.dev ## give 52,000 broken inputs to the readers of jobs, BVH files and calibrations
-	BODYCAP_FUZZ_SHARE=1 $(PYTEST) -m slow tests/unit/test_fuzz.py $(ARGS)
+fuzz: $(VENV)/.dev ## give 72,000 broken inputs to the readers of jobs, BVH files, calibrations and telemetry
+	BODYCAP_FUZZ_SHARE=1 $(PYTEST) -m slow tests/unit/test_fuzz.py tests/unit/telemetry/test_gopro.py $(ARGS)
 
 .PHONY: test-cluster
 test-cluster: $(VENV)/.dev ## run jobs on a Dask scheduler and workers of this machine, killing some

@@ -9,10 +9,11 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 LONGEST = (
-    "pipeline/test_hard_captures.py",
     "pipeline/test_hard_lenses.py",
+    "pipeline/test_misleading_pictures.py",
     "pipeline/test_resume_proof.py",
     "pipeline/test_field_captures.py",
+    "pipeline/test_hard_captures.py",
     "data",
     "pipeline/test_damage_proof.py",
     "browser",

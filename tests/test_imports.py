@@ -29,8 +29,9 @@ assert (cv2.imread(str(folder / "image.png")) == image).all()
 numpy.savez_compressed(folder / "arrays.npz", image=image)
 assert (numpy.load(folder / "arrays.npz")["image"] == image).all()
 """
-# Copies of this process import one module each: the libraries, and the job's models, are loaded once.
-# What is loaded already is not looked through for garbage in each copy.
+# Python imports the packages of a module before the module. So a package is imported once, and copies of this
+# process import the modules in it, one each; a module that its package brings in has been reached like that.
+# The libraries, and the job's models, are loaded once; what is loaded is not looked through for garbage.
 ALONE = """
 import concurrent.futures.thread, filecmp, gc, html, http.server, importlib, os, queue, shlex, sys, traceback
 import webbrowser, zlib
@@ -38,17 +39,21 @@ import numpy, pydantic, scipy.spatial.transform, scipy.optimize, scipy.sparse, s
 import cv2, gtsam
 import bodycap_batch.config.models
 gc.disable()
-for name in sys.argv[1:]:
+def reach(name):
+    importlib.import_module(name)
+    inside = [each for each in sys.argv[1:] if each.rpartition(".")[0] == name]
+    return all([reach(each) if each in sys.modules else reach_in_copy(each) for each in inside])
+def reach_in_copy(name):
     if pid := os.fork():
-        if os.waitpid(pid, 0)[1]:
-            print(name)
-        continue
+        if failed := os.waitpid(pid, 0)[1]:
+            print(name, flush=True)
+        return not failed
     try:
-        importlib.import_module(name)
+        os._exit(0 if reach(name) else 1)
     except BaseException:
         traceback.print_exc()
         os._exit(1)
-    os._exit(0)
+reach("bodycap_batch")
 """
 # What costs tenths of seconds to seconds to load, or changes the process (pycolmap takes over SIGTERM).
 HEAVY = ("pycolmap", "open3d", "gtsam", "cv2", "av", "matplotlib", "pandas", "distributed", "pytest")

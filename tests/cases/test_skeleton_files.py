@@ -65,6 +65,7 @@ def test_turned_skeletons_give_the_same_motion(
     for path in data_root.joinpath("walk12").iterdir():
         if path.suffix in (".mp4", ".json"):
             (videos / path.name).symlink_to(path)
+    (videos / "job.yaml").write_text("export: {preview: false}\n")
     results = []
     for path in files:
         out = tmp_path / path.stem

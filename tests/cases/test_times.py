@@ -75,6 +75,7 @@ def test_copies(data_root: Path, tmp_path: Path, capfd: pytest.CaptureFixture[st
 def test_a_run_leaves_copies_out(data_root: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     video = case(data_root, "duplicated_frames") / "torso.mp4"
     folder, out = walk12_with(data_root, tmp_path / "walk", video), tmp_path / "out"
+    (folder / "job.yaml").write_text("export: {preview: false}\n")
     assert main(["run", str(folder), "--skeleton", "none", "--out", str(out)]) == 0
     assert "24 of 118 frames are copies" in capfd.readouterr().err
     assert main(["evaluate", str(out), str(data_root / "walk12" / "gt"), "--json"]) == 0

@@ -50,7 +50,8 @@ def test_a_camera_that_nobody_wears_has_its_path_in_the_scene_of_the_body(
     ]
     lens = json.loads((capture / "calib.json").read_text())
     block = {key: lens[key] for key in ("width", "height", "model", "params")}
-    job = {"capture": {"clocks": "common", "calibration": block, "cameras": cameras}}
+    capture_block = {"clocks": "common", "calibration": block, "cameras": cameras}
+    job = {"capture": capture_block, "export": {"preview": False}}
     (tmp_path / "job.yaml").write_text(yaml.safe_dump(job))
     assert main(["run", str(tmp_path / "job.yaml"), "--out", str(out), "--threads", "2"]) == 0
     metrics = json.loads((out / "metrics.json").read_text())

@@ -2,9 +2,9 @@
 
 The environment names a JSON file with the orders:
 
-- ``{"kill": "before" | "after", "at": text, "done": file}``: the command and all its children get SIGKILL
-just before or just after the first rename at which no earlier run was killed. Only renames with the text in
-their target count.
+- ``{"kill": "before" | "after", "at": pattern, "done": file}``: the command and all its children get SIGKILL
+just before or just after the first rename at which no earlier run was killed. Only renames count whose target
+contains a match of the regular expression.
 - ``{"fill": stage, "disk": folder}``: the disk is filled to the last byte when this stage starts.
 
 It also names a JSON file with the version of each stage's algorithm, which the test computed once.
@@ -56,7 +56,7 @@ def kill_everything() -> None:
 def killing(rename: Callable[..., None], orders: Mapping[str, str]) -> Callable[..., None]:
     def wrapped(source: Any, target: Any, **values: Any) -> None:
         place = rename_name(Path(target))
-        if orders["at"] not in place:
+        if not re.search(orders["at"], place):
             return rename(source, target, **values)
         with Path(orders["done"]).open("a+") as done:
             # Child processes run in parallel: a second one that gets here waits until it is killed.

@@ -27,6 +27,7 @@ from bodycap_batch.core.errors import BodycapError, CaptureError, JobError
 from bodycap_batch.formats.bvh import read_bvh
 from bodycap_batch.model.camera import CAMERA_MODELS
 from tests.bodies import BVH_PAIR
+from tests.fuzzing import DEFAULT_FRACTION, FRACTION_VARIABLE
 
 FAST = settings(
     deadline=None, derandomize=True, database=None,
@@ -251,9 +252,6 @@ CASES = {
     "calibration text": (calibration, mutations(json.dumps(CALIBRATION, indent=1)).map(utf8), 8_000),
 }
 """Reader, inputs, and their number in ``make fuzz``: 52,000 in all, chosen by the cost of one input."""
-FRACTION_VARIABLE = "BODYCAP_FUZZ_SHARE"
-"""Environment variable with the fraction of these inputs that the slow tests take."""
-DEFAULT_FRACTION = "0.2"
 
 
 def run(name: str, count: int) -> None:

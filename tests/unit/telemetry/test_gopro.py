@@ -1,5 +1,6 @@
 """Telemetry of GoPro cameras: rates, axes, units, lost payloads, chapters, timelapse, damage."""
 
+import os
 import struct
 import tracemalloc
 from dataclasses import replace
@@ -13,6 +14,7 @@ from bodycap_batch.formats.gpmf import Damage, gopro_model, read_items
 from bodycap_batch.telemetry import read_telemetry
 from bodycap_batch.telemetry.gopro import gopro_telemetry, has_telemetry_track, read_gpmf_payloads
 from bodycap_batch.telemetry.streams import EXPOSURE
+from tests.fuzzing import DEFAULT_FRACTION, FRACTION_VARIABLE
 from tests.gpmf import Sensor, header, item, nested, payloads, raw, with_wide_offsets, write_gopro
 from tests.videos import textured_frame
 
@@ -345,8 +347,9 @@ def test_some_hundred_damaged_tracks():
 
 
 @pytest.mark.slow
-def test_twenty_thousand_damaged_tracks():
-    _fuzz(2, 20_000)
+def test_thousands_of_damaged_tracks():
+    """Twenty thousand with ``make fuzz``, and the same fraction of them as of its other inputs without."""
+    _fuzz(2, round(20_000 * float(os.environ.get(FRACTION_VARIABLE, DEFAULT_FRACTION))))
 
 
 def test_memory_is_bounded():
