@@ -48,8 +48,6 @@ from bodycap_batch.config.videos_beside import VideosBeside, find_videos_beside
 from bodycap_batch.config.yaml_source import Location, YamlSource, dotted, read_yaml
 from bodycap_batch.core.errors import CaptureError, JobError
 
-_LISTS = ("video", "timestamps")
-"""Names of the fields of a camera in which a job file may give a single path instead of a list of paths."""
 RESULTS = "out"
 """Name of the folder for results beside a job. The folder of one job's results is a subfolder of it."""
 
@@ -296,8 +294,7 @@ def _stated_without_places(source: _Source, overrides: Overrides, *, alone: bool
             source.path, stated.cameras, lambda name: are_found or overrides.is_known(name)
         )
         if beside.cameras:
-            listed = _with_lists(data)["capture"]
-            capture = {**listed, "cameras": [*listed["cameras"], *beside.cameras]}
+            capture = {**data["capture"], "cameras": [*data["capture"]["cameras"], *beside.cameras]}
             job = _validated({**data, "capture": capture}, source)
     return _StatedJob(
         source=source, job=job, stated=stated, uses_folder=uses_folder, is_alone=alone, beside=beside
@@ -494,23 +491,9 @@ def _validated(data: dict[str, Any], source: _Source) -> Job:
     for a number.
     """
     try:
-        return Job.model_validate_json(json.dumps(_with_lists(data)), strict=True)
+        return Job.model_validate_json(json.dumps(data), strict=True)
     except ValidationError as error:
         raise source.error(problems_of(error, Job, data)) from error
-
-
-def _with_lists(data: dict[str, Any]) -> dict[str, Any]:
-    """Replace a single path by a list with one path, because the strict validation does not convert it."""
-    capture = data.get("capture")
-    if not isinstance(capture, dict) or not isinstance(capture.get("cameras"), list):
-        return data
-    cameras = [
-        {key: [v] if key in _LISTS and isinstance(v, str) else v for key, v in camera.items()}
-        if isinstance(camera, dict)
-        else camera
-        for camera in capture["cameras"]
-    ]
-    return {**data, "capture": {**capture, "cameras": cameras}}
 
 
 def _with_overrides(job: Job, overrides: Overrides) -> Job:

@@ -93,6 +93,11 @@ def _none_if_auto(value: object) -> object:
     return None if value == "auto" else value
 
 
+def _as_tuple(value: object) -> object:
+    """Return a tuple for a single path and for a list of paths; else the value unchanged."""
+    return (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
+
+
 AnyCalibration = Annotated[
     Annotated[Calibration, Tag("inline")]
     | Annotated[Literal["auto"], Tag("auto")]
@@ -104,6 +109,7 @@ Seconds = Annotated[float, Field(ge=-MAX_TIME_S, le=MAX_TIME_S)]
 _Drift = Annotated[float, Field(ge=-MAX_DRIFT_PPM, le=MAX_DRIFT_PPM)]
 _Component = Annotated[float, Field(ge=-_MAX_ROTATION, le=_MAX_ROTATION)]
 _Metres = Annotated[float, Field(ge=-MAX_REACH_M, le=MAX_REACH_M)]
+_Paths = Annotated[tuple[Path, ...], BeforeValidator(_as_tuple)]
 Row = tuple[_Component, _Component, _Component, _Metres]
 Activity = Literal["walk", "generic"]
 
@@ -129,7 +135,7 @@ class CameraConfig(_Block):
     """One camera of the capture. Loaded jobs hold absolute paths and list all chapters and sidecar files."""
 
     name: str = Field(max_length=64, description="name of the camera; the camera's results have this name")
-    video: tuple[Path, ...] = Field(
+    video: _Paths = Field(
         min_length=1, description="a video file, a folder of chapters, or a list of chapters"
     )
     mount: str | None = Field(
@@ -173,7 +179,7 @@ class CameraConfig(_Block):
         description="field of view along the long side of the picture, in degrees; `calibration: "
         "auto` starts from this value",
     )
-    timestamps: tuple[Path, ...] = Field(
+    timestamps: _Paths = Field(
         (),
         description="file with one time for each frame, in seconds (other units are recognised); one file "
         "for all chapters, or one file for each chapter",
