@@ -276,23 +276,17 @@ def _stated_job(source: _Source, overrides: Overrides, *, alone: bool) -> _State
 
 
 def _stated_without_places(source: _Source, overrides: Overrides, *, alone: bool) -> _StatedJob:
-    if source.file is None:
-        refuse_missing_cameras(source.path)
-        job = _validated({"capture": folder_capture(source.path, overrides.is_known)}, source)
-        return _StatedJob(source=source, job=job, stated=_without_cameras(job.capture), uses_folder=True)
-    stated_data = _top_mapping(source.file)
-    data = stated_data if alone else _with_folder_capture(stated_data, source.folder, overrides)
+    stated_data = {} if source.file is None else _top_mapping(source.file)
+    data = stated_data if alone else _with_folder_capture(stated_data, source, overrides)
     job = _validated(data, source)
     if data is not stated_data:
-        return _StatedJob(source=source, job=job, stated=_without_cameras(job.capture), uses_folder=True)
+        stated = job.capture.model_copy(update={"cameras": ()})
+        return _StatedJob(source=source, job=job, stated=stated, uses_folder=True)
     uses_folder = not alone and source.is_folder and not (source.folder / RUN_FILE).is_file()
     stated, beside = job.capture, VideosBeside()
     # The videos of a synthetic capture exist only after they have been rendered, so they are not looked for.
     if uses_folder and not stated.cameras_only and stated.synthetic is None:
-        are_found = bool(stated.places)
-        beside = find_videos_beside(
-            source.path, stated.cameras, lambda name: are_found or overrides.is_known(name)
-        )
+        beside = find_videos_beside(source.path, stated.cameras, _knows(data, overrides))
         if beside.cameras:
             capture = {**data["capture"], "cameras": [*data["capture"]["cameras"], *beside.cameras]}
             job = _validated({**data, "capture": capture}, source)
@@ -301,8 +295,10 @@ def _stated_without_places(source: _Source, overrides: Overrides, *, alone: bool
     )
 
 
-def _without_cameras(capture: CaptureConfig) -> CaptureConfig:
-    return capture.model_copy(update={"cameras": ()})
+def _knows(data: Mapping[str, Any], overrides: Overrides) -> Callable[[str], bool]:
+    """Return a function that returns True if the place of a video is known, or found by the run."""
+    are_found = bool(data.get("capture", {}).get("places"))
+    return lambda name: are_found or overrides.is_known(name)
 
 
 def _resolved_job(
@@ -463,25 +459,28 @@ def _top_mapping(source: YamlSource) -> dict[str, Any]:
     return source.data
 
 
-def _with_folder_capture(data: dict[str, Any], folder: Path, overrides: Overrides) -> dict[str, Any]:
-    """Return the data of a job file. If no cameras are listed, add the videos in the job file's folder.
+def _with_folder_capture(data: dict[str, Any], source: _Source, overrides: Overrides) -> dict[str, Any]:
+    """Return the data of a job. If no cameras are listed, add the videos in the folder of the job.
 
-    The cameras are named after these videos, as for a folder without a job file. Data with an unknown key are
-    returned unchanged, because the unknown key may be a misspelt ``cameras``.
+    A folder without a job file is a job without data. Data with an unknown key are returned unchanged,
+    because the unknown key may be a misspelt ``cameras``.
     """
     capture = data.get("capture", {})
     if not isinstance(capture, dict) or "cameras" in capture or capture.get("cameras_only") is True:
         return data
     if not (data.keys() <= Job.model_fields.keys() and capture.keys() <= CaptureConfig.model_fields.keys()):
         return data
-    refuse_missing_cameras(folder)
+    refuse_missing_cameras(source.folder)
     try:
-        videos_in(folder)
-    except CaptureError:  # no videos here: the validation reports the missing cameras
-        return data
-    are_found = bool(capture.get("places"))
-    found = folder_capture(folder, lambda name: are_found or overrides.is_known(name))
-    return {**data, "capture": {**found, **capture}}
+        videos_in(source.folder)
+    except CaptureError:
+        if source.file is None:
+            raise
+        return data  # no videos here: the validation reports the missing cameras
+    return {
+        **data,
+        "capture": {**folder_capture(source.folder, _knows(data, overrides)), **capture},
+    }
 
 
 def _validated(data: dict[str, Any], source: _Source) -> Job:
