@@ -18,8 +18,6 @@ from bodycap_batch.clocks.joint_offsets import (
     CRYSTAL_SIGMA_PPM,
     MAX_DRIFT_PPM,
     ClockPair,
-    JointClock,
-    JointClocks,
     solve_clocks,
 )
 from bodycap_batch.clocks.motion_score import (
@@ -30,6 +28,7 @@ from bodycap_batch.clocks.motion_score import (
 )
 from bodycap_batch.clocks.motion_signals import STEP_S, CameraPath, MotionSignals, motion_signals
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.model.scene import Trajectory
 
 MIN_COMMON_S = 2.0
@@ -124,7 +123,7 @@ class MotionClocks:
     """
 
     reference: str
-    clocks: dict[str, JointClock]
+    clocks: dict[str, ClockRelation]
     curves: tuple[MotionCurve, ...]
     reasons: dict[str, str]
 
@@ -333,9 +332,8 @@ def motion_clocks(paths: Sequence[CameraPath], reference: str) -> MotionClocks:
     starts = {path.camera: path.times_ns[0] * 1e-9 for path in paths if len(path.times_ns)}
     starts.setdefault(reference, 0.0)
     floors = {path.camera: _limb_lag_s(path) for path in paths}
-    solved: JointClocks[ClockPair] = solve_clocks(
-        reference, [pair for pair in pairs if pair is not None], starts, floors
-    )
+    clear = [pair for pair in pairs if pair is not None]
+    solved = solve_clocks(reference, clear, starts, floors, "motion")
     for name in offsets_s:
         clock = solved.clocks.get(name)
         if clock is None:

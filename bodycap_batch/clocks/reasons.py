@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 from bodycap_batch.clocks.container_times import DAY_S, ExpectedOffset
 from bodycap_batch.clocks.joint_offsets import MAX_SIGMAS, JointClocks, connected_cameras
-from bodycap_batch.clocks.pair_offsets import PairOffset
 from bodycap_batch.clocks.sound_evidence import Recording, SoundEvidence
 from bodycap_batch.model.camera_clock import ClockSource
 
@@ -40,7 +39,7 @@ def describe_contradiction(
 
 
 def contradictions_of_sound(
-    name: str, evidence: SoundEvidence, joint: JointClocks[PairOffset], stated_s: float | None
+    name: str, evidence: SoundEvidence, joint: JointClocks, stated_s: float | None
 ) -> Iterator[str]:
     """Yield what contradicts the clock that the sound gives for a camera other than the reference camera.
 
@@ -66,7 +65,7 @@ def contradictions_of_sound(
             )
 
 
-def dropped_pairs(name: str, joint: JointClocks[PairOffset]) -> Iterator[str]:
+def dropped_pairs(name: str, joint: JointClocks) -> Iterator[str]:
     """Yield which pairs of a camera contradict the other pairs."""
     for pair, residual_s in joint.dropped:
         if name in (pair.first, pair.second):
