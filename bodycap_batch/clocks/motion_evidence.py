@@ -104,14 +104,15 @@ def _against_stated(motion: MotionClocks, camera: str, offset_s: float) -> str:
         if {curve.first, curve.second} != {motion.reference, camera}:
             continue
         sign = 1.0 if curve.first == motion.reference else -1.0
-        if not curve.lags_s[0] <= sign * offset_s <= curve.lags_s[-1]:
+        lags_s, score = curve.scores.lags_s, curve.scores.score
+        if not lags_s[0] <= sign * offset_s <= lags_s[-1]:
             continue
-        best = int(np.argmax(curve.score))
-        drop = float(curve.score[best] - np.interp(sign * offset_s, curve.lags_s, curve.score))
+        best = int(np.argmax(score))
+        drop = float(score[best] - np.interp(sign * offset_s, lags_s, score))
         if drop >= _MIN_SCORE_DROP:
             return (
                 f"the motion contradicts the offset of {offset_s:.3f} s that the job uses: an offset of "
-                f"about {sign * curve.lags_s[best]:.1f} s fits much better"
+                f"about {sign * lags_s[best]:.1f} s fits much better"
             )
     return ""
 

@@ -9,6 +9,7 @@ from bodycap_batch.clocks.container_times import ContainerTime
 from bodycap_batch.clocks.estimate import ClockEstimate, ClockEstimates
 from bodycap_batch.clocks.motion_evidence import add_motion
 from bodycap_batch.clocks.motion_offsets import MotionClocks, MotionCurve
+from bodycap_batch.clocks.motion_score import MotionScore
 from bodycap_batch.clocks.motion_signals import CameraPath, motion_signals
 from bodycap_batch.clocks.pair_offsets import PairOffset
 from bodycap_batch.clocks.sound_evidence import Recording, SoundEvidence
@@ -124,7 +125,7 @@ def test_a_stated_offset_is_compared_with_the_best_one(height: float, first: str
     assert signals is not None
     curve = MotionCurve(
         first=first, second=second, signals=(signals, signals), weights_hz=(), limb_lag_s=0.0,
-        lags_s=lags_s, common_s=0.0 * lags_s, score=score,
+        scores=MotionScore(lags_s, 0.0 * lags_s, score),
     )  # fmt: skip
     motion = moved(None, curves=(curve,))
     assert added(NONE, motion, palm=0.8).against_stated == ""
