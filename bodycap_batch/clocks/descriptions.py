@@ -48,7 +48,7 @@ def clocks_from_motion_notes(spec: CaptureConfig, *, with_body: bool) -> list[st
     ]
 
 
-def describe_clocks(spec: CaptureConfig, *, with_body: bool, threads: int | None = None) -> list[str]:
+def describe_clocks(spec: CaptureConfig, *, with_body: bool) -> list[str]:
     """Return a sentence for the user about the clock of each camera, and what may be missing without it.
 
     The clocks are those that are stated, or that the sound determines.
@@ -56,14 +56,13 @@ def describe_clocks(spec: CaptureConfig, *, with_body: bool, threads: int | None
     Args:
         spec: The capture block of a job, as returned by `load_job`.
         with_body: True if the job asks for the motion of the body.
-        threads: Number of cameras or pairs that are worked on at the same time; None for all processors.
 
     Raises:
         CaptureError: A video or its timestamps cannot be used.
     """
     if len(spec.cameras) < 2:
         return []
-    estimates = estimate_clocks(spec, threads)
+    estimates = estimate_clocks(spec)
     clocks = decide_clocks(spec, estimates)
     base_s = clocks.cameras[clocks.reference].offset_s
     lines = []

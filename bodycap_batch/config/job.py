@@ -56,17 +56,16 @@ Prepare = Callable[[Mapping[str, Any], Path, Path], None]
 for the videos, and the folder for the results of the job."""
 
 
-def results_of_job(path: Path, overrides: Overrides | None = None) -> Path:
+def results_of_job(path: Path) -> Path:
     """Return the folder for the results of a job. Of a job file, only the name and the folder are read.
 
     Args:
         path: Path of a YAML file or of a folder of videos.
-        overrides: Values of the command line.
 
     Raises:
         JobError: The file is no YAML file, or there is none.
     """
-    return _source_at(path.resolve(), None, Limits()).stated_results(overrides or Overrides())
+    return _source_at(path.resolve(), None, Limits()).stated_results(Overrides())
 
 
 def load_job(
