@@ -344,8 +344,7 @@ def _resolved_job(
         calibration_files=frozenset(
             camera.calibration_file for camera in cameras if camera.calibration_file is not None
         ),
-        reasons=stated.beside.reasons,
-        unreadable=stated.beside.unreadable,
+        beside=stated.beside,
         unlisted=_reason_of_unlisted(stated),
         warnings=(
             *stated.beside.warnings,
