@@ -27,6 +27,7 @@ from bodycap_batch.config.foreign_calibrations import (
     parse_calibration,
 )
 from bodycap_batch.config.mounts import mount_of
+from bodycap_batch.config.options import Options
 from bodycap_batch.config.yaml_source import MAX_BYTES
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera import (
@@ -123,13 +124,11 @@ class CalibratedWith(BaseModel):
     notes: tuple[str, ...] = Field((), description="reasons why the calibration may be wrong")
 
 
-class Calibration(BaseModel):
+class Calibration(Options):
     """Intrinsics of a camera at the size of its calibration images.
 
     The images are upright, as a video player shows them.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     model: str = Field(description="COLMAP camera model")
     params: tuple[Annotated[float, AllowInfNan()], ...] = Field(

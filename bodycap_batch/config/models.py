@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag
 
 from bodycap_batch.config.body_height import MAX_HEIGHT_M, MIN_HEIGHT_M, height_from_text
 from bodycap_batch.config.bounds import (
@@ -27,6 +27,7 @@ from bodycap_batch.config.options import (
     KeyframeOptions,
     MapOptions,
     MergeOptions,
+    Options,
     RegistrationOptions,
     TelemetryOptions,
 )
@@ -51,12 +52,6 @@ MAX_NAME_LENGTH = 100
 Evidence: none."""
 _MAX_FRAME = 10**8
 """Maximum number of a frame of a skeleton file: a day of motion at the maximum rate has 86 million frames."""
-
-
-class _Block(BaseModel):
-    """Base class of the job's blocks: immutable; unknown keys, NaN and infinity are refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 def _calibration_kind(value: object) -> str:
@@ -114,7 +109,7 @@ Row = tuple[_Component, _Component, _Component, _Metres]
 Activity = Literal["walk", "generic"]
 
 
-class MountPose(_Block):
+class MountPose(Options):
     """Pose of a camera relative to the joint of its bone: x_in_joint = rotation · x_in_cam + translation."""
 
     translation_m: tuple[_Metres, _Metres, _Metres]
@@ -131,7 +126,7 @@ _FILE_FIELDS = ("video", "timestamps", "calibration", "samples", "mask")
 """Names of the fields of a camera that hold paths."""
 
 
-class CameraConfig(_Block):
+class CameraConfig(Options):
     """One camera of the capture. Loaded jobs hold absolute paths and list all chapters and sidecar files."""
 
     name: str = Field(max_length=64, description="name of the camera; the camera's results have this name")
@@ -262,7 +257,7 @@ class CameraConfig(_Block):
         return (*self.video, *self.timestamps, *(() if self.mask is None else (self.mask,)))
 
 
-class CaptureConfig(_Block):
+class CaptureConfig(Options):
     """The videos of one recording."""
 
     cameras: tuple[CameraConfig, ...] = Field(
@@ -335,7 +330,7 @@ class CaptureConfig(_Block):
         return [cameras for cameras in by_role.values() if len(cameras) > 1]
 
 
-class Job(_Block):
+class Job(Options):
     """A job: everything that a run needs. Without named cameras, the videos in the job's folder are used."""
 
     capture: CaptureConfig
