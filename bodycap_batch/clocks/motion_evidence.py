@@ -124,7 +124,7 @@ def _from_motion(
     found = replace(estimate, **{**clock.values(), "notes": estimate.notes})
     if reference is None or recording is None or clock.drift_ppm:
         return found
-    start_s = reference.first_frame_s - recording.first_frame_s
+    start_s = reference.start.first_frame_s - recording.start.first_frame_s
     prior = _EQUAL_COUNT_PRIOR if recording.frames == reference.frames else _OTHER_PRIOR
     posterior = _common_start_probability(clock.offset_s - start_s, clock.sigma_s, prior)
     if posterior < _MIN_POSTERIOR:

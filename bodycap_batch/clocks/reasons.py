@@ -104,10 +104,10 @@ def reasons_without_clock(name: str, reference: str, evidence: SoundEvidence) ->
 def _gap_s(expected: ExpectedOffset, first: Recording, second: Recording) -> float:
     """Return the time between two recordings according to their files, seconds; 0 if they may overlap."""
     low_s, high_s = expected.limits()
-    if second.first_frame_s + low_s > first.end_s:
-        return second.first_frame_s + expected.offset_s - first.end_s
-    if first.first_frame_s > second.end_s + high_s:
-        return first.first_frame_s - second.end_s - expected.offset_s
+    if second.start.first_frame_s + low_s > first.end_s:
+        return second.start.first_frame_s + expected.offset_s - first.end_s
+    if first.start.first_frame_s > second.end_s + high_s:
+        return first.start.first_frame_s - second.end_s - expected.offset_s
     return 0.0
 
 

@@ -34,7 +34,6 @@ class Recording:
         notes: Notes for the user about the sound.
         recorder: Device and encoder of the sound; None without sound.
         start: Start of the recording according to the container.
-        first_frame_s: Time of the first frame on the clock of the camera, seconds.
         end_s: End of the sound, or of the pictures without usable sound, on the clock of the camera, seconds.
         frames: Number of frames.
     """
@@ -45,7 +44,6 @@ class Recording:
     notes: tuple[str, ...]
     recorder: Recorder | None
     start: ContainerTime
-    first_frame_s: float
     end_s: float
     frames: int
 
@@ -160,15 +158,13 @@ def _read_recording(config: CameraConfig) -> tuple[Recording, SoundTrack]:
     videos = index_videos(config.video, 1)
     times_ns = join_chapters(videos, config.timestamps).times_ns
     track = read_sound_track(config.name, videos, times_ns)
-    first_frame_s = int(times_ns[0]) / 1e9
     recording = Recording(
         camera=config.name,
         sound_start_s=track.start_s if track.pieces else None,
         problem=track.problem,
         notes=track.notes,
         recorder=track.recorder,
-        start=read_container_time(videos, first_frame_s),
-        first_frame_s=first_frame_s,
+        start=read_container_time(videos, int(times_ns[0]) / 1e9),
         end_s=track.end_s if track.pieces else int(times_ns[-1]) / 1e9,
         frames=len(times_ns),
     )

@@ -117,9 +117,11 @@ def resolved_camera(
         samples=_file_origin(
             () if config.samples is None else (config.samples,), is_stated=camera.samples is not None
         ),
-        clock_offset=_offset_in_file(entry, file, is_stated=is_stated)
-        if camera.offset_s is None and entry is not None and entry.offset_s is not None
-        else _clock_origin(camera, capture, camera.offset_s, "s"),
+        clock_offset=_clock_origin(camera, capture, camera.offset_s, "s")
+        if camera.offset_s is not None or file is None or entry is None or entry.offset_s is None
+        else Origin(source="job file", value=f"{entry.offset_s:g} s in {file.name}")
+        if is_stated
+        else Origin(source="calib.json", value=f"{entry.offset_s:g} s"),
         clock_drift=_clock_origin(camera, capture, camera.drift_ppm, "ppm"),
         mount=_mount_origin(config, capture.places, placed.get(config.name, "job file")),
         mount_pose=Origin(source="default", value="typical of the place")
@@ -152,13 +154,6 @@ def _file_origin(files: tuple[Path, ...], *, is_stated: bool) -> Origin | None:
     """Return the origin of files that lie beside the video or that the job names; None if there are none."""
     source: Source = "job file" if is_stated else "sidecar file"
     return Origin(source=source, value=_file_names(files)) if files else None
-
-
-def _offset_in_file(entry: CalibrationEntry, file: Path | None, *, is_stated: bool) -> Origin:
-    """Return the origin of a clock offset in a calibration file, which the job may name."""
-    if is_stated and file is not None:
-        return Origin(source="job file", value=f"{entry.offset_s:g} s in {file.name}")
-    return Origin(source="calib.json", value=f"{entry.offset_s:g} s")
 
 
 def _clock_origin(camera: CameraConfig, capture: CaptureConfig, stated: float | None, unit: str) -> Origin:

@@ -52,7 +52,6 @@ def recordings(*frames: int) -> SoundEvidence:
                 notes=(),
                 recorder=None,
                 start=start,
-                first_frame_s=0.0,
                 end_s=count / 30,
                 frames=count,
             )
