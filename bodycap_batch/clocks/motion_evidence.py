@@ -150,33 +150,26 @@ def _common_start_probability(difference_s: float, sigma_s: float, prior: float)
 
 def _complete_from_sound(found: dict[str, ClockEstimate], pairs: tuple[PairOffset, ...]) -> None:
     """Determine unknown clocks from the sound of cameras whose clocks are known from the motion, in place."""
-    accepted: Mapping[tuple[str, str], PairOffset] = {
-        (pair.first, pair.second): pair for pair in pairs if pair.accepted
-    }
     while True:
         news = {}
-        for (first, second), pair in accepted.items():
-            one, two = found[first], found[second]
-            if one.is_known and not two.is_known:
-                news[second] = _through_pair(two, one, pair, is_second=True)
-            elif two.is_known and not one.is_known:
-                news[first] = _through_pair(one, two, pair, is_second=False)
+        for pair in pairs:
+            unknown, known = sorted((found[pair.first], found[pair.second]), key=lambda each: each.is_known)
+            if pair.accepted and known.is_known and not unknown.is_known:
+                news[unknown.camera] = _through_pair(unknown, known, pair)
         if not news:
             return
         found.update(news)
 
 
-def _through_pair(
-    unknown: ClockEstimate, known: ClockEstimate, pair: PairOffset, *, is_second: bool
-) -> ClockEstimate:
+def _through_pair(unknown: ClockEstimate, known: ClockEstimate, pair: PairOffset) -> ClockEstimate:
     """Return a clock from the clock of another camera and the sound of both.
 
     Args:
         unknown: The estimate of the camera without a clock.
         known: The clock of the other camera.
         pair: What the sound of both says.
-        is_second: True if the camera without a clock is the second of the pair.
     """
+    is_second = unknown.camera == pair.second
     first_s, second_s = pair.pivot_s + pair.offset_s, pair.pivot_s
     own_s, other_s = (second_s, first_s) if is_second else (first_s, second_s)
     drift_ppm = known.drift_ppm + (pair.drift_ppm if is_second else -pair.drift_ppm)

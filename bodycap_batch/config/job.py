@@ -245,7 +245,7 @@ class _StatedJob:
         uses_folder: True if the job uses the videos and the calibration in its folder.
         is_alone: True for a job file that another user submitted without a folder.
         beside: The videos in the folder that the job file does not list.
-        placed: Where the place of a camera comes from if not from the job file, by camera name.
+        placed: Where the place of a camera comes from if the job states it, by camera name.
     """
 
     source: _Source
@@ -266,11 +266,10 @@ def _stated_job(source: _Source, overrides: Overrides, *, alone: bool) -> _State
         alone: True for a job file that another user submitted without a folder.
     """
     stated = _stated_without_places(source, overrides, alone=alone)
-    listed = stated.job.capture.cameras
-    placed = {camera.name: given[1] for camera in listed if (given := overrides.place_of(camera)) is not None}
-    cameras = tuple(map(overrides.mounted, listed))
-    overrides.require_used(listed)
-    capture = stated.job.capture.model_copy(update={"cameras": cameras})
+    mounted = [overrides.mounted(camera) for camera in stated.job.capture.cameras]
+    placed = {camera.name: source for camera, source in mounted}
+    overrides.require_used(stated.job.capture.cameras)
+    capture = stated.job.capture.model_copy(update={"cameras": tuple(camera for camera, _ in mounted)})
     return replace(stated, job=stated.job.model_copy(update={"capture": capture}), placed=placed)
 
 

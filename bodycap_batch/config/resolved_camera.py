@@ -70,7 +70,7 @@ def resolved_camera(
         stated: The capture as the job file states it. It has fewer cameras if videos beside the job file were
             added. If there is no job file, it has no cameras.
         base: Folder to which the paths of the capture are relative.
-        placed: Where the place of a camera comes from if not from the job file, by camera name.
+        placed: Where the place of a camera comes from if the job states it, by camera name.
 
     Raises:
         CaptureError: A calibration cannot be used, a folder holds no video, or the number of timestamp files
@@ -123,7 +123,7 @@ def resolved_camera(
         if is_stated
         else Origin(source="calib.json", value=f"{entry.offset_s:g} s"),
         clock_drift=_clock_origin(camera, capture, camera.drift_ppm, "ppm"),
-        mount=_mount_origin(config, capture.places, placed.get(config.name, "job file")),
+        mount=_mount_origin(config, capture.places, placed[config.name]),
         mount_pose=Origin(source="default", value="typical of the place")
         if camera.joint_from_cam is None
         else Origin(source="job file", value="measured"),
