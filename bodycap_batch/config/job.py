@@ -318,14 +318,14 @@ def _resolved_job(
             error.message += f"; also {dotted(found.location)}: {found.message}"
         raise error
     if policy is not None:
-        policy.require_named(job, base)
+        policy.require_files(job, base)
     if job.capture.synthetic is not None:
         _prepare_synthetic(job, stated, overrides, prepare)
     _require_plausible_calibrations(job, source)
     if stated.uses_folder:
         job = job.model_copy(update={"capture": with_found_calibrations(job.capture, base)})
         if policy is not None:  # before a calibration is read
-            policy.require_named(job, base)
+            policy.require_files(job, base)
     cameras = [
         resolved_camera(index, job.capture, stated.stated, base, stated.placed)
         for index in range(len(job.capture.cameras))
@@ -334,7 +334,7 @@ def _resolved_job(
     if policy is None:
         _require_apart(resolved, source.path)
     else:  # the folder of the results is not checked, because the operator chooses it
-        policy.require_resolved(resolved)
+        policy.require_files(resolved, base)
     return LoadedJob(
         job=resolved,
         origins={camera.config.name: camera.origins for camera in cameras},
