@@ -67,25 +67,19 @@ def describe_clocks(spec: CaptureConfig, *, with_body: bool) -> list[str]:
     base_s = clocks.cameras[clocks.reference].offset_s
     lines = []
     for name, clock in clocks.cameras.items():
-        text = f"{name}: clock offset {describe_clock(clock, base_s)}"
         if name == clocks.reference:
-            text = f"{name}: reference clock"
-        elif not clock.is_known:
+            text = "reference clock"
+        elif clock.is_known:
+            text = f"clock offset {_clock_text(clock, base_s)}"
+        else:
             reasons = "; ".join(estimates.camera(name).reasons)
-            text = f"{name}: the sound does not give the clock offset ({reasons})"
-        lines.append("; ".join([text, *(clock.notes if clock.is_known else ())]))
+            text = f"the sound does not give the clock offset ({reasons})"
+        lines.append("; ".join([f"{name}: {text}", *(clock.notes if clock.is_known else ())]))
     return [*lines, *clocks_from_motion_notes(with_known_offsets(spec, clocks), with_body=with_body)]
 
 
-def describe_clock(clock: ClockRelation, reference_offset_s: float = 0.0) -> str:
-    """Return a clock as text for the user, relative to the reference camera.
-
-    Args:
-        clock: The clock.
-        reference_offset_s: Offset of the reference camera's clock, seconds.
-    """
-    if not clock.is_known:
-        return "unknown"
+def _clock_text(clock: ClockRelation, reference_offset_s: float) -> str:
+    """Return a known clock as text for the user, relative to the reference camera's clock (seconds)."""
     text = f"{clock.offset_s - reference_offset_s:+.4f}"
     if clock.sigma_s:
         text += f" ± {clock.sigma_s:.4f}"
