@@ -204,12 +204,11 @@ def _best_fit(
     If `lens` is ``auto``, the fisheye model is the best fit only if its error is clearly smaller.
     """
     fits = [fit for model in _MODELS[lens] if (fit := fit_intrinsics(model, views, size)) is not None]
-    best = fits[0] if fits else None
-    for other in fits[1:]:
-        assert best is not None
-        if other.rms_px < _MAX_FISHEYE_ERROR_RATIO * best.rms_px:
-            best = other
-    return best
+
+    def weighed(fit: IntrinsicsFit) -> float:
+        return fit.rms_px * (1.0 if fit.model == "OPENCV_FISHEYE" else _MAX_FISHEYE_ERROR_RATIO)
+
+    return min(fits, key=weighed, default=None)
 
 
 def select_diverse_views(views: Sequence[BoardCorners], size: ImageSize, count: int) -> list[int]:

@@ -50,7 +50,7 @@ class IntrinsicsFit:
     rms_px: float
     view_rms_px: tuple[float, ...]
     focal_sigma_px: tuple[float, float]
-    kept: tuple[int, ...]
+    kept: tuple[int, ...] = ()
 
     @property
     def params(self) -> list[float]:
@@ -116,7 +116,6 @@ def _fit_pinhole(model: str, views: Sequence[BoardCorners], size: ImageSize) -> 
         rms_px=float(rms),
         view_rms_px=tuple(float(value) for value in np.asarray(view_errors).ravel()),
         focal_sigma_px=(float(deviation[0]), float(deviation[1])),
-        kept=(),
     )
 
 
@@ -188,7 +187,6 @@ def _fisheye_fit_with_errors(
         rms_px=float(np.sqrt(total / max(count, 1))),
         view_rms_px=tuple(errors),
         focal_sigma_px=(float(np.sqrt(covariance[0, 0])), float(np.sqrt(covariance[1, 1]))),
-        kept=(),
     )
 
 

@@ -185,15 +185,6 @@ class CaptureCamera:
         for index, frame, video in self._frames(indices, skip_lost=True):
             yield index, work_image(frame, video.orientation, size, colour=False)
 
-    def decodable_frames(self) -> Generator[tuple[int, VideoFrame, VideoFile], None, None]:
-        """Decode all frames from the videos. Frames that cannot be decoded are omitted.
-
-        Yields:
-            The index into `frame_numbers`, the decoded frame, and the video file of its chapter. The frame's
-            `is_corrupt` is True if the decoder found damaged data in the frame.
-        """
-        return self._frames(np.arange(len(self.frame_numbers), dtype=np.int64), skip_lost=True)
-
     def read(
         self, indices: Sequence[int] | IntArray, *, colour: bool = False
     ) -> Generator[tuple[int, Image], None, None]:
@@ -239,7 +230,9 @@ class CaptureCamera:
     def _frame_candidates(self) -> Generator[FrameCandidate, None, None]:
         size = (self.camera.width_px, self.camera.height_px)
         keep_all = self.should_keep_all
-        for index, frame, video in self.decodable_frames():
+        for index, frame, video in self._frames(
+            np.arange(len(self.frame_numbers), dtype=np.int64), skip_lost=True
+        ):
             if frame.is_corrupt:
                 continue
             if keep_all:
@@ -311,10 +304,7 @@ class Capture:
         Raises:
             KeyError: There is no camera with this name.
         """
-        for camera in self.cameras:
-            if camera.name == name:
-                return camera
-        raise KeyError(name)
+        return {camera.name: camera for camera in self.cameras}[name]
 
 
 def _identity(planes: tuple[Planes, Colours]) -> tuple[Planes, Colours]:

@@ -157,12 +157,9 @@ def _check_one_format(videos: tuple[VideoFile, ...]) -> None:
 def _in_time_range(times_ns: IntArray, offset_s: float, spec: CaptureConfig) -> BoolArray:
     """Return a mask (N,) that is True for frames between start_s and end_s on the common clock."""
     common = times_ns + round(offset_s * 1e9)
-    is_inside = np.ones(len(common), dtype=bool)
-    if spec.start_s is not None:
-        is_inside &= common >= round(spec.start_s * 1e9)
-    if spec.end_s is not None:
-        is_inside &= common <= round(spec.end_s * 1e9)
-    return is_inside
+    first = -np.inf if spec.start_s is None else round(spec.start_s * 1e9)
+    last = np.inf if spec.end_s is None else round(spec.end_s * 1e9)
+    return np.asarray((common >= first) & (common <= last))
 
 
 def _no_frames_error(

@@ -75,7 +75,7 @@ def with_clocks_of_run(estimates: ClockEstimates, results: Path) -> ClockEstimat
         stored = {}
 
     def completed(clock: ClockEstimate) -> ClockEstimate:
-        if clock.source != "none":
+        if clock.is_known:
             return clock
         found, values, reason = stored.get(clock.camera, {}), {}, "needs a run, which compares the motion"
         if found.get("source") == "motion":
@@ -89,12 +89,17 @@ _KEYS = ("offset_s", "sigma_s", "drift_ppm", "drift_sigma_ppm", "source")
 """Keys of a clock in ``metrics.json`` and in the JSON output."""
 
 
+def _values(clock: ClockEstimate) -> dict[str, object]:
+    values = {key: getattr(clock, key) for key in _KEYS}
+    return values if clock.is_known else {**values, "offset_s": None, "sigma_s": None}
+
+
 def clocks_as_json(estimates: ClockEstimates) -> dict[str, object]:
     """Return the clocks as plain JSON values."""
     return {
         "reference": estimates.reference,
-        "clocks": {clock.camera: {key: getattr(clock, key) for key in _KEYS} for clock in estimates.cameras},
-        "contradictions": {clock.camera: list(clock.contradictions) for clock in estimates.cameras},
+        "clocks": {clock.camera: _values(clock) for clock in estimates.cameras},
+        "contradictions": {clock.camera: list(clock.notes) for clock in estimates.cameras},
         "reasons": {clock.camera: list(clock.reasons) for clock in estimates.cameras},
     }
 
@@ -107,7 +112,7 @@ def lines_of(estimates: ClockEstimates) -> Iterator[str]:
     for clock in estimates.cameras:
         yield f"{clock.camera:{width}}  {_figures(clock)}  {clock.source}"
     for clock in estimates.cameras:
-        for kind, texts in (("contradiction", clock.contradictions), ("note", clock.reasons)):
+        for kind, texts in (("contradiction", clock.notes), ("note", clock.reasons)):
             for text in texts:
                 mark = f"{kind}: {clock.camera}: "
                 yield from textwrap.wrap(text, 100, initial_indent=mark, subsequent_indent="  ")
@@ -122,7 +127,7 @@ def lines_of(estimates: ClockEstimates) -> Iterator[str]:
 
 
 def _figures(clock: ClockEstimate) -> str:
-    if clock.offset_s is None or clock.sigma_s is None:
+    if not clock.is_known:
         return f"{'unknown':>12}  {'':>9}  {'':>16}"
     drift = f"{clock.drift_ppm:+.1f} ± {clock.drift_sigma_ppm:.1f} ppm" if clock.sigma_s else ""
     sigma = f"{1e3 * clock.sigma_s:.1f} ms" if clock.sigma_s else ""

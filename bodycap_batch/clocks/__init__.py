@@ -4,7 +4,6 @@ from bodycap_batch.clocks.capture_clocks import decide_clocks, with_known_offset
 from bodycap_batch.clocks.descriptions import (
     clock_notes,
     clocks_from_motion_notes,
-    describe_clock,
     describe_clocks,
 )
 from bodycap_batch.clocks.estimate import (
@@ -15,12 +14,10 @@ from bodycap_batch.clocks.estimate import (
     stated_offsets,
 )
 from bodycap_batch.clocks.motion_evidence import add_motion
-from bodycap_batch.clocks.motion_offsets import clocks_from_paths, motion_clocks
-from bodycap_batch.clocks.motion_signals import CameraPath
+from bodycap_batch.clocks.motion_offsets import clocks_from_paths
 from bodycap_batch.clocks.sound_evidence import SoundEvidence, measure_sound
 
 __all__ = [
-    "CameraPath",
     "ClockEstimate",
     "ClockEstimates",
     "SoundEvidence",
@@ -30,11 +27,9 @@ __all__ = [
     "clocks_from_paths",
     "combine_evidence",
     "decide_clocks",
-    "describe_clock",
     "describe_clocks",
     "estimate_clocks",
     "measure_sound",
-    "motion_clocks",
     "stated_offsets",
     "with_known_offsets",
 ]

@@ -87,26 +87,14 @@ def _clock_of(
 
 
 def _estimated_clock(estimate: ClockEstimate, base_s: float) -> ClockRelation:
-    if estimate.source not in ESTIMATED_SOURCES or estimate.offset_s is None:
+    if estimate.source not in ESTIMATED_SOURCES:
         why = "; ".join(estimate.reasons) or "neither the sound nor the motion determines it"
         return ClockRelation(
             drift_sigma_ppm=CRYSTAL_SIGMA_PPM,
             source="none",
             notes=(f"the clock is unknown: {why}; {UNKNOWN_CLOCK_HINT}",),
         )
-    correlation = 0.0
-    if estimate.covariance is not None and estimate.sigma_s and estimate.drift_sigma_ppm:
-        correlation = float(estimate.covariance[0, 1]) / (estimate.sigma_s * estimate.drift_sigma_ppm)
-    return ClockRelation(
-        offset_s=base_s + estimate.offset_s,
-        sigma_s=estimate.sigma_s or 0.0,
-        drift_ppm=estimate.drift_ppm,
-        drift_sigma_ppm=estimate.drift_sigma_ppm,
-        correlation=correlation,
-        source=estimate.source,
-        notes=estimate.contradictions,
-        is_contradicted=estimate.is_contradicted,
-    )
+    return replace(ClockRelation(**estimate.values()), offset_s=base_s + estimate.offset_s)
 
 
 def _with_shared_clock(group: dict[str, ClockRelation]) -> dict[str, ClockRelation]:

@@ -48,7 +48,7 @@ def clocks_from_motion_notes(spec: CaptureConfig, *, with_body: bool) -> list[st
     ]
 
 
-def describe_clocks(spec: CaptureConfig, *, with_body: bool, threads: int | None = None) -> list[str]:
+def describe_clocks(spec: CaptureConfig, *, with_body: bool) -> list[str]:
     """Return a sentence for the user about the clock of each camera, and what may be missing without it.
 
     The clocks are those that are stated, or that the sound determines.
@@ -56,37 +56,30 @@ def describe_clocks(spec: CaptureConfig, *, with_body: bool, threads: int | None
     Args:
         spec: The capture block of a job, as returned by `load_job`.
         with_body: True if the job asks for the motion of the body.
-        threads: Number of cameras or pairs that are worked on at the same time; None for all processors.
 
     Raises:
         CaptureError: A video or its timestamps cannot be used.
     """
     if len(spec.cameras) < 2:
         return []
-    estimates = estimate_clocks(spec, threads)
+    estimates = estimate_clocks(spec)
     clocks = decide_clocks(spec, estimates)
     base_s = clocks.cameras[clocks.reference].offset_s
     lines = []
     for name, clock in clocks.cameras.items():
-        text = f"{name}: clock offset {describe_clock(clock, base_s)}"
         if name == clocks.reference:
-            text = f"{name}: reference clock"
-        elif not clock.is_known:
+            text = "reference clock"
+        elif clock.is_known:
+            text = f"clock offset {_clock_text(clock, base_s)}"
+        else:
             reasons = "; ".join(estimates.camera(name).reasons)
-            text = f"{name}: the sound does not give the clock offset ({reasons})"
-        lines.append("; ".join([text, *(clock.notes if clock.is_known else ())]))
+            text = f"the sound does not give the clock offset ({reasons})"
+        lines.append("; ".join([f"{name}: {text}", *(clock.notes if clock.is_known else ())]))
     return [*lines, *clocks_from_motion_notes(with_known_offsets(spec, clocks), with_body=with_body)]
 
 
-def describe_clock(clock: ClockRelation, reference_offset_s: float = 0.0) -> str:
-    """Return a clock as text for the user, relative to the reference camera.
-
-    Args:
-        clock: The clock.
-        reference_offset_s: Offset of the reference camera's clock, seconds.
-    """
-    if not clock.is_known:
-        return "unknown"
+def _clock_text(clock: ClockRelation, reference_offset_s: float) -> str:
+    """Return a known clock as text for the user, relative to the reference camera's clock (seconds)."""
     text = f"{clock.offset_s - reference_offset_s:+.4f}"
     if clock.sigma_s:
         text += f" ± {clock.sigma_s:.4f}"

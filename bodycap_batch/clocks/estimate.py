@@ -4,77 +4,39 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from bodycap_batch.clocks.joint_offsets import (
     CRYSTAL_SIGMA_PPM,
     UNLIKE_SIGMA_S,
     WAY_SIGMA_S,
-    JointClock,
     solve_clocks,
 )
 from bodycap_batch.clocks.pair_offsets import PairOffset
 from bodycap_batch.clocks.reasons import contradictions_of_sound, dropped_pairs, reasons_without_clock
 from bodycap_batch.clocks.sound_evidence import Recording, SoundEvidence, measure_sound
 from bodycap_batch.config.models import CaptureConfig
-from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.model.camera_clock import ClockSource
+from bodycap_batch.model.camera_clock import ClockRelation, ClockSource
 
 STATED_SIGMA_S = 1.0 / 30.0
 """Standard deviation of a stated offset, seconds. Origin: a clap is found to a frame or so in each video."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ClockEstimate:
-    """The clock of one camera: common time = camera time · (1 + drift_ppm · 1e-6) + offset_s.
+class ClockEstimate(ClockRelation):
+    """The clock of one camera relative to the reference camera, whose time is the common time.
 
-    The common time is that of the reference camera.
+    The notes say what contradicts the clock. It is contradicted if the motion contradicts it.
 
     Attributes:
         camera: Name of the camera.
-        offset_s: Offset at camera time 0, seconds; None if it is unknown.
-        sigma_s: Standard deviation of the offset, seconds; None if it is unknown.
-        drift_ppm: Drift, parts per million; 0 if it was not measured.
-        drift_sigma_ppm: Standard deviation of the drift.
-        source: ``sound``; ``motion``; ``stated``: in the job or the calibration; ``common``: the reference
-            camera, and cameras with the same trigger; ``none``: unknown.
-        covariance: (2,2) covariance of offset (seconds) and drift (ppm); None if it is unknown.
         reasons: Why the sound gives no clock, and notes about the sound.
-        contradictions: What contradicts the clock.
-        is_contradicted: True if the motion contradicts the clock.
         against_stated: How the motion contradicts the stated offset; empty if it does not.
     """
 
     camera: str
-    offset_s: float | None = None
-    sigma_s: float | None = None
-    drift_ppm: float = 0.0
     drift_sigma_ppm: float = CRYSTAL_SIGMA_PPM
     source: ClockSource = "none"
-    covariance: FloatArray | None = None
     reasons: tuple[str, ...] = ()
-    contradictions: tuple[str, ...] = ()
-    is_contradicted: bool = False
     against_stated: str = ""
-
-    def solved(self, clock: JointClock, source: ClockSource) -> ClockEstimate:
-        """Return the estimate with a solved clock from this source."""
-        return replace(
-            self,
-            offset_s=clock.offset_s,
-            sigma_s=clock.sigma_s,
-            drift_ppm=clock.drift_ppm if clock.drift_measured else 0.0,
-            drift_sigma_ppm=clock.drift_sigma_ppm,
-            source=source,
-            covariance=clock.covariance,
-        )
-
-    def sigma_at(self, camera_s: float) -> float | None:
-        """Return the standard deviation of the common time at a camera time, seconds; None if unknown."""
-        if self.covariance is None:
-            return self.sigma_s
-        row = np.array([1.0, 1e-6 * camera_s])
-        return float(np.sqrt(row @ self.covariance @ row))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,9 +85,7 @@ def combine_evidence(spec: CaptureConfig, evidence: SoundEvidence) -> ClockEstim
     """
     reference = spec.reference_camera().name
     if not evidence.recordings:
-        only = ClockEstimate(
-            camera=reference, offset_s=0.0, sigma_s=0.0, drift_sigma_ppm=0.0, source="common"
-        )
+        only = ClockEstimate(camera=reference, drift_sigma_ppm=0.0, source="common")
         return ClockEstimates(reference=reference, cameras=(only,))
     recordings = evidence.by_camera()
     starts_s = {
@@ -145,16 +105,14 @@ def combine_evidence(spec: CaptureConfig, evidence: SoundEvidence) -> ClockEstim
             contradictions += tuple(contradictions_of_sound(name, evidence, joint, stated.get(name)))
         if best is None:
             reasons = (*reasons_without_clock(name, reference, evidence), *reasons)
-        clock = ClockEstimate(camera=name, reasons=reasons, contradictions=contradictions)
+        clock = ClockEstimate(camera=name, reasons=reasons)
         if name in common:
-            clock = replace(
-                clock, offset_s=stated.get(name, 0.0), sigma_s=0.0, drift_sigma_ppm=0.0, source="common"
-            )
+            clock = replace(clock, offset_s=stated.get(name, 0.0), drift_sigma_ppm=0.0, source="common")
         elif best is not None:
-            clock = clock.solved(best, "sound")
+            clock = replace(clock, **best.values())
         elif name in stated:
             clock = replace(clock, offset_s=stated[name], sigma_s=STATED_SIGMA_S, source="stated")
-        clocks.append(clock)
+        clocks.append(replace(clock, notes=contradictions))
     return ClockEstimates(reference=reference, cameras=tuple(clocks), pairs=evidence.pairs)
 
 

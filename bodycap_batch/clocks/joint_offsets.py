@@ -7,14 +7,13 @@ that contradict the others of a loop are dropped.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
 
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.camera_clock import ClockRelation, ClockSource
 
 CRYSTAL_SIGMA_PPM = 40.0
 """Standard deviation of the drift between two clocks, ppm, if it was not measured. Origin: crystals have a
@@ -69,43 +68,8 @@ class ClockPair:
     evidence: float = 0.0
 
 
-Pair = TypeVar("Pair", bound=ClockPair)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
-class JointClock:
-    """The clock of one camera: common time = camera time · (1 + drift_ppm · 1e-6) + offset_s.
-
-    Attributes:
-        offset_s: Offset at camera time 0, seconds.
-        drift_ppm: Drift, parts per million.
-        covariance: (2,2) covariance of offset (seconds) and drift (ppm).
-        drift_measured: True if the drift was measured, and not assumed to be 0.
-    """
-
-    offset_s: float
-    drift_ppm: float
-    covariance: FloatArray
-    drift_measured: bool
-
-    @property
-    def sigma_s(self) -> float:
-        """Standard deviation of the offset, seconds."""
-        return float(np.sqrt(self.covariance[0, 0]))
-
-    def sigma_at(self, camera_s: float) -> float:
-        """Return the standard deviation of the common time at a camera time, seconds."""
-        row = np.array([1.0, 1e-6 * camera_s])
-        return float(np.sqrt(row @ self.covariance @ row))
-
-    @property
-    def drift_sigma_ppm(self) -> float:
-        """Standard deviation of the drift, parts per million."""
-        return float(np.sqrt(self.covariance[1, 1]))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class JointClocks(Generic[Pair]):
+class JointClocks:
     """The clocks of all cameras that are connected to the reference camera.
 
     Attributes:
@@ -113,16 +77,17 @@ class JointClocks(Generic[Pair]):
         dropped: Pairs that contradict a loop, with the residual in seconds.
     """
 
-    clocks: dict[str, JointClock]
-    dropped: tuple[tuple[Pair, float], ...]
+    clocks: dict[str, ClockRelation]
+    dropped: tuple[tuple[ClockPair, float], ...]
 
 
 def solve_clocks(
     reference: str,
-    pairs: Sequence[Pair],
+    pairs: Sequence[ClockPair],
     starts_s: Mapping[str, float],
     floors_s: Mapping[str, float],
-) -> JointClocks[Pair]:
+    source: ClockSource = "sound",
+) -> JointClocks:
     """Solve the clocks of all cameras from accepted pairs.
 
     Args:
@@ -131,34 +96,35 @@ def solve_clocks(
         starts_s: Start of the sound of each camera on its own clock, seconds.
         floors_s: Standard deviation, seconds, of the offset of each camera that more sound does not reduce:
             `WAY_SIGMA_S` or `UNLIKE_SIGMA_S`, or that of the motion.
+        source: What was measured.
     """
     used = list(pairs)
-    dropped: list[tuple[Pair, float]] = []
+    dropped: list[tuple[ClockPair, float]] = []
     while True:
         names = connected_cameras(reference, used)
         inside = [pair for pair in used if pair.first in names]
-        others = [name for name in names if name != reference]
-        solution, covariance, residuals = _solve(others, inside, starts_s, reference)
+        solution, covariance, residuals = _solve(names, inside, starts_s)
         sigmas = np.array([np.hypot(pair.sigma_s, WAY_SIGMA_S) for pair in inside])
         if not inside or np.abs(residuals / sigmas).max() <= _MAX_CLOSURE_SIGMAS:
             break
-        worst = _worst_pair(reference, names, inside, starts_s)
-        dropped.append((worst, _closure_s(reference, worst, inside, starts_s)))
-        used.remove(worst)
-    clocks = {
-        reference: JointClock(offset_s=0.0, drift_ppm=0.0, covariance=np.zeros((2, 2)), drift_measured=True)
-    }
+        dropped.append(_worst_pair(names, inside, starts_s))
+        used.remove(dropped[-1][0])
+    clocks = {reference: ClockRelation()}
     measured = connected_cameras(reference, [pair for pair in inside if pair.drift_measured])
-    for index, name in enumerate(others):
+    for index, name in enumerate(names[1:]):
         # From the offset at the start of the sound to that at camera time 0.
         shift = np.array([[1.0, -1e-6 * starts_s[name]], [0.0, 1.0]])
         own = covariance[2 * index : 2 * index + 2, 2 * index : 2 * index + 2]
-        offset_s, drift_ppm = shift @ solution[2 * index : 2 * index + 2]
-        clocks[name] = JointClock(
-            offset_s=float(offset_s),
-            drift_ppm=float(drift_ppm),
-            covariance=shift @ own @ shift.T + np.diag([floors_s[name] ** 2, 0.0]),
-            drift_measured=name in measured,
+        offset_s, drift_ppm = (shift @ solution[2 * index : 2 * index + 2]).tolist()
+        own = shift @ own @ shift.T + np.diag([floors_s[name] ** 2, 0.0])
+        sigma_s, drift_sigma_ppm = np.sqrt(np.diag(own)).tolist()
+        clocks[name] = ClockRelation(
+            offset_s=offset_s,
+            sigma_s=sigma_s,
+            drift_ppm=drift_ppm if name in measured else 0.0,
+            drift_sigma_ppm=drift_sigma_ppm,
+            correlation=float(own[0, 1]) / (sigma_s * drift_sigma_ppm),
+            source=source,
         )
     return JointClocks(clocks=clocks, dropped=tuple(dropped))
 
@@ -175,9 +141,11 @@ def connected_cameras(reference: str, pairs: Sequence[ClockPair]) -> list[str]:
 
 
 def _solve(
-    others: Sequence[str], pairs: Sequence[ClockPair], starts_s: Mapping[str, float], reference: str
+    names: Sequence[str], pairs: Sequence[ClockPair], starts_s: Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Solve the weighted equations of the pairs. A drift that no pair measures is 0 ± `CRYSTAL_SIGMA_PPM`.
+
+    The first of the names is that of the reference camera.
 
     Returns:
         (2n,) offset at the start of the sound (seconds) and drift (ppm) of each camera but the reference, its
@@ -185,67 +153,58 @@ def _solve(
     """
     offsets, drifts = [], []
     for pair in pairs:
-        offset, drift = np.zeros(2 * len(others)), np.zeros(2 * len(others))
-        for name, time_s, sign in (
-            (pair.second, pair.pivot_s, 1.0),
-            (pair.first, pair.pivot_s + pair.offset_s, -1.0),
-        ):
-            if name in others:
-                column = 2 * others.index(name)
-                offset[column] = sign
-                offset[column + 1] = sign * 1e-6 * (time_s - starts_s[name])
-                drift[column + 1] = sign
+        offset, drift = _equations(pair, names, starts_s)
         offsets.append((offset, pair.offset_s, 1.0 / max(pair.sigma_s, _MIN_SIGMA_S)))
         if pair.drift_measured:
             drifts.append((drift, pair.drift_ppm, 1.0 / pair.drift_sigma_ppm))
     if not offsets:
         return np.zeros(0), np.zeros((0, 0)), np.zeros(0)
-    measured = connected_cameras(reference, [pair for pair in pairs if pair.drift_measured])
-    for index, name in enumerate(others):
+    measured = connected_cameras(names[0], [pair for pair in pairs if pair.drift_measured])
+    count = len(names) - 1
+    for index, name in enumerate(names[1:]):
         if name not in measured:
-            drifts.append((np.eye(2 * len(others))[2 * index + 1], 0.0, 1.0 / CRYSTAL_SIGMA_PPM))
+            drifts.append((np.eye(2 * count)[2 * index + 1], 0.0, 1.0 / CRYSTAL_SIGMA_PPM))
     matrix, target, weight = (np.array(each) for each in zip(*offsets, *drifts, strict=True))
     # The columns are scaled, because seconds and ppm have different sizes.
-    scale = np.tile([1e-3, 1.0], len(others))
+    scale = np.tile([1e-3, 1.0], count)
     weighted = matrix * weight[:, None] * scale
     inverse = np.linalg.pinv(weighted.T @ weighted)
     solution = scale * (inverse @ (weighted.T @ (target * weight)))
     return solution, inverse * np.outer(scale, scale), (target - matrix @ solution)[: len(offsets)]
 
 
+def _equations(
+    pair: ClockPair, names: Sequence[str], starts_s: Mapping[str, float]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the rows (2n,) of a pair's offset and drift; the columns are as in `_solve`."""
+    offset, drift = np.zeros(2 * len(names) - 2), np.zeros(2 * len(names) - 2)
+    for name, time_s, sign in (
+        (pair.second, pair.pivot_s, 1.0),
+        (pair.first, pair.pivot_s + pair.offset_s, -1.0),
+    ):
+        if name != names[0]:
+            column = 2 * names.index(name) - 2
+            offset[column] = sign
+            offset[column + 1] = sign * 1e-6 * (time_s - starts_s[name])
+            drift[column + 1] = sign
+    return offset, drift
+
+
 def _worst_pair(
-    reference: str, names: Sequence[str], pairs: Sequence[Pair], starts_s: Mapping[str, float]
-) -> Pair:
-    """Return the pair without which the others agree best; of equal ones, that with the least evidence."""
-    others = [name for name in names if name != reference]
+    names: Sequence[str], pairs: Sequence[ClockPair], starts_s: Mapping[str, float]
+) -> tuple[ClockPair, float]:
+    """Return the pair without which the others agree best; of equal ones, that with the least evidence.
 
-    def disagreement(pair: Pair) -> tuple[float, float]:
-        _, _, residuals = _solve(others, [each for each in pairs if each is not pair], starts_s, reference)
-        # Residuals below the way of sound are equal.
-        return max(float(np.abs(residuals).max(initial=0.0)), 2.0 * WAY_SIGMA_S), pair.evidence
-
-    in_loops = [
-        pair
-        for pair in pairs
-        if len(connected_cameras(reference, [each for each in pairs if each is not pair])) == len(names)
-    ]
-    return min(in_loops, key=disagreement)  # residuals exist only in loops
-
-
-def _closure_s(reference: str, pair: Pair, pairs: Sequence[Pair], starts_s: Mapping[str, float]) -> float:
-    """Return the offset of a pair minus that which the other pairs give, seconds."""
-    rest = [each for each in pairs if each is not pair]
-    names = [name for name in connected_cameras(reference, rest) if name != reference]
-    solution, _, _ = _solve(names, rest, starts_s, reference)
-    common = []
-    for name, time_s in ((pair.second, pair.pivot_s), (pair.first, pair.pivot_s + pair.offset_s)):
-        offset, drift = (
-            (0.0, 0.0) if name == reference else solution[2 * names.index(name) : 2 * names.index(name) + 2]
-        )
-        common.append(time_s + offset + 1e-6 * drift * (time_s - starts_s.get(name, 0.0)))
-    return float(common[1] - common[0])
-
-
-def camera_pairs(cameras: Sequence[str]) -> list[tuple[str, str]]:
-    """Return all pairs of cameras."""
-    return list(itertools.combinations(cameras, 2))
+    With it is returned its offset minus that which the other pairs give, seconds.
+    """
+    found = []
+    for pair in pairs:
+        rest = [each for each in pairs if each is not pair]
+        if len(connected_cameras(names[0], rest)) == len(names):  # residuals exist only in loops
+            solution, _, residuals = _solve(names, rest, starts_s)
+            # Residuals below the way of sound are equal.
+            disagreement = max(float(np.abs(residuals).max(initial=0.0)), 2.0 * WAY_SIGMA_S)
+            closure_s = pair.offset_s - float(_equations(pair, names, starts_s)[0] @ solution)
+            found.append(((disagreement, pair.evidence), pair, closure_s))
+    _, worst, closure_s = min(found, key=lambda each: each[0])
+    return worst, closure_s

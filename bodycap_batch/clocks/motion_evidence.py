@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from bodycap_batch.clocks.estimate import ClockEstimate, ClockEstimates
-from bodycap_batch.clocks.joint_offsets import CRYSTAL_SIGMA_PPM, MAX_SIGMAS, WAY_SIGMA_S, JointClock
+from bodycap_batch.clocks.joint_offsets import CRYSTAL_SIGMA_PPM, MAX_SIGMAS, WAY_SIGMA_S
 from bodycap_batch.clocks.motion_offsets import MotionClocks
 from bodycap_batch.clocks.pair_offsets import PairOffset
 from bodycap_batch.clocks.sound_evidence import Recording, SoundEvidence
+from bodycap_batch.model.camera_clock import ClockRelation
 
 _MAX_DIFFERENCE_S = 1.0 / 30.0
 """Difference, seconds, of sound and motion that is no contradiction. Origin: one frame at 30 fps."""
@@ -70,9 +71,9 @@ def add_motion(
     return replace(estimates, cameras=tuple(found[each.camera] for each in estimates.cameras))
 
 
-def _compared(estimate: ClockEstimate, clock: JointClock | None) -> ClockEstimate:
+def _compared(estimate: ClockEstimate, clock: ClockRelation | None) -> ClockEstimate:
     """Return the clock from the sound, compared with the clock from the motion."""
-    if clock is None or estimate.offset_s is None or estimate.sigma_s is None:
+    if clock is None:
         return estimate
     difference_s = clock.offset_s - estimate.offset_s
     sigma_s = float(np.hypot(clock.sigma_s, estimate.sigma_s))
@@ -81,17 +82,12 @@ def _compared(estimate: ClockEstimate, clock: JointClock | None) -> ClockEstimat
             f"the motion gives an offset of {clock.offset_s:.3f} ± {clock.sigma_s:.3f} s, but the "
             f"sound gives {estimate.offset_s:.3f} ± {estimate.sigma_s:.3f} s"
         )
-        return replace(estimate, contradictions=(*estimate.contradictions, text), is_contradicted=True)
+        return replace(estimate, notes=(*estimate.notes, text), is_contradicted=True)
     if estimate.sigma_s < 0.5 * clock.sigma_s:
         return estimate
     weight = estimate.sigma_s**2 / (estimate.sigma_s**2 + clock.sigma_s**2)
     mean_sigma_s = estimate.sigma_s * clock.sigma_s / sigma_s
-    return replace(
-        estimate,
-        offset_s=estimate.offset_s + weight * difference_s,
-        sigma_s=mean_sigma_s,
-        covariance=None if estimate.covariance is None else _with_sigma(estimate.covariance, mean_sigma_s),
-    )
+    return replace(estimate, offset_s=estimate.offset_s + weight * difference_s, sigma_s=mean_sigma_s)
 
 
 def _against_stated(motion: MotionClocks, camera: str, offset_s: float) -> str:
@@ -108,40 +104,33 @@ def _against_stated(motion: MotionClocks, camera: str, offset_s: float) -> str:
         if {curve.first, curve.second} != {motion.reference, camera}:
             continue
         sign = 1.0 if curve.first == motion.reference else -1.0
-        if not curve.lags_s[0] <= sign * offset_s <= curve.lags_s[-1]:
+        lags_s, score = curve.scores.lags_s, curve.scores.score
+        if not lags_s[0] <= sign * offset_s <= lags_s[-1]:
             continue
-        best = int(np.argmax(curve.score))
-        drop = float(curve.score[best] - np.interp(sign * offset_s, curve.lags_s, curve.score))
+        best = int(np.argmax(score))
+        drop = float(score[best] - np.interp(sign * offset_s, lags_s, score))
         if drop >= _MIN_SCORE_DROP:
             return (
                 f"the motion contradicts the offset of {offset_s:.3f} s that the job uses: an offset of "
-                f"about {sign * curve.lags_s[best]:.1f} s fits much better"
+                f"about {sign * lags_s[best]:.1f} s fits much better"
             )
     return ""
 
 
-def _with_sigma(covariance: np.ndarray, sigma_s: float) -> np.ndarray:
-    """Return a covariance (2,2) of offset and drift with another sigma of the offset."""
-    factor = np.diag([sigma_s / np.sqrt(covariance[0, 0]), 1.0])
-    return np.asarray(factor @ covariance @ factor)
-
-
 def _from_motion(
-    estimate: ClockEstimate, clock: JointClock, reference: Recording | None, recording: Recording | None
+    estimate: ClockEstimate, clock: ClockRelation, reference: Recording | None, recording: Recording | None
 ) -> ClockEstimate:
     """Return the clock from the motion, or a common start if that is much more probable."""
-    found = estimate.solved(clock, "motion")
-    if reference is None or recording is None or clock.drift_measured:
+    found = replace(estimate, **{**clock.values(), "notes": estimate.notes})
+    if reference is None or recording is None or clock.drift_ppm:
         return found
-    start_s = reference.first_frame_s - recording.first_frame_s
+    start_s = reference.start.first_frame_s - recording.start.first_frame_s
     prior = _EQUAL_COUNT_PRIOR if recording.frames == reference.frames else _OTHER_PRIOR
     posterior = _common_start_probability(clock.offset_s - start_s, clock.sigma_s, prior)
     if posterior < _MIN_POSTERIOR:
         return found
     sigma_s = float(np.sqrt(1.0 - posterior) * np.hypot(clock.offset_s - start_s, clock.sigma_s))
-    return replace(
-        found, offset_s=start_s, sigma_s=sigma_s, covariance=_with_sigma(clock.covariance, sigma_s)
-    )
+    return replace(found, offset_s=start_s, sigma_s=sigma_s)
 
 
 def _common_start_probability(difference_s: float, sigma_s: float, prior: float) -> float:
@@ -161,35 +150,26 @@ def _common_start_probability(difference_s: float, sigma_s: float, prior: float)
 
 def _complete_from_sound(found: dict[str, ClockEstimate], pairs: tuple[PairOffset, ...]) -> None:
     """Determine unknown clocks from the sound of cameras whose clocks are known from the motion, in place."""
-    accepted: Mapping[tuple[str, str], PairOffset] = {
-        (pair.first, pair.second): pair for pair in pairs if pair.accepted
-    }
     while True:
         news = {}
-        for (first, second), pair in accepted.items():
-            one, two = found[first], found[second]
-            if one.offset_s is not None and two.offset_s is None:
-                news[second] = _through_pair(two, one, pair, is_second=True)
-            elif two.offset_s is not None and one.offset_s is None:
-                news[first] = _through_pair(one, two, pair, is_second=False)
+        for pair in pairs:
+            unknown, known = sorted((found[pair.first], found[pair.second]), key=lambda each: each.is_known)
+            if pair.accepted and known.is_known and not unknown.is_known:
+                news[unknown.camera] = _through_pair(unknown, known, pair)
         if not news:
             return
         found.update(news)
 
 
-def _through_pair(
-    unknown: ClockEstimate, known: ClockEstimate, pair: PairOffset, *, is_second: bool
-) -> ClockEstimate:
+def _through_pair(unknown: ClockEstimate, known: ClockEstimate, pair: PairOffset) -> ClockEstimate:
     """Return a clock from the clock of another camera and the sound of both.
 
     Args:
         unknown: The estimate of the camera without a clock.
         known: The clock of the other camera.
         pair: What the sound of both says.
-        is_second: True if the camera without a clock is the second of the pair.
     """
-    assert known.offset_s is not None
-    assert known.sigma_s is not None
+    is_second = unknown.camera == pair.second
     first_s, second_s = pair.pivot_s + pair.offset_s, pair.pivot_s
     own_s, other_s = (second_s, first_s) if is_second else (first_s, second_s)
     drift_ppm = known.drift_ppm + (pair.drift_ppm if is_second else -pair.drift_ppm)
@@ -205,5 +185,4 @@ def _through_pair(
         drift_ppm=drift_ppm,
         drift_sigma_ppm=drift_sigma_ppm,
         source="motion",
-        covariance=np.diag([sigma_s**2, drift_sigma_ppm**2]),
     )

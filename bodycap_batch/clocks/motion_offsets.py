@@ -18,18 +18,18 @@ from bodycap_batch.clocks.joint_offsets import (
     CRYSTAL_SIGMA_PPM,
     MAX_DRIFT_PPM,
     ClockPair,
-    JointClock,
-    JointClocks,
     solve_clocks,
 )
 from bodycap_batch.clocks.motion_score import (
     LIMB_WEIGHTS_HZ,
     TRUNK_WEIGHTS_HZ,
+    MotionScore,
     mean_square_distance,
     motion_score,
 )
 from bodycap_batch.clocks.motion_signals import STEP_S, CameraPath, MotionSignals, motion_signals
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.model.scene import Trajectory
 
 MIN_COMMON_S = 2.0
@@ -88,9 +88,7 @@ class MotionCurve:
         signals: Signals of both.
         weights_hz: Weights of the parts of the score.
         limb_lag_s: Standard deviation of the offset that more motion does not reduce, seconds.
-        lags_s: (L,) offsets, seconds.
-        common_s: (L,) times in which both cameras were localised, seconds.
-        score: (L,) scores.
+        scores: The scores.
     """
 
     first: str
@@ -98,18 +96,7 @@ class MotionCurve:
     signals: tuple[MotionSignals, MotionSignals] = field(repr=False)
     weights_hz: tuple[float, ...]
     limb_lag_s: float
-    lags_s: FloatArray = field(repr=False)
-    common_s: FloatArray = field(repr=False)
-    score: FloatArray = field(repr=False)
-
-    def at(self, lags_s: FloatArray) -> FloatArray:
-        """Return the score at offsets (K,), seconds; 0 where it is unknown."""
-        from scipy.interpolate import CubicSpline
-
-        out = np.zeros(len(lags_s))
-        inside = (lags_s >= self.lags_s[0]) & (lags_s <= self.lags_s[-1])
-        out[inside] = CubicSpline(self.lags_s, self.score)(lags_s[inside])
-        return out
+    scores: MotionScore = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,7 +111,7 @@ class MotionClocks:
     """
 
     reference: str
-    clocks: dict[str, JointClock]
+    clocks: dict[str, ClockRelation]
     curves: tuple[MotionCurve, ...]
     reasons: dict[str, str]
 
@@ -193,9 +180,7 @@ def _pair_curves(
                     signals=(one, two),
                     weights_hz=weights_hz,
                     limb_lag_s=max(_limb_lag_s(first), _limb_lag_s(second)),
-                    lags_s=found.lags_s,
-                    common_s=found.common_s,
-                    score=found.score,
+                    scores=found,
                 )
             )
     return curves
@@ -219,13 +204,12 @@ def _find_peak(lags_s: FloatArray, score: FloatArray, step_s: float, limb_lag_s:
 
 def _refined(curve: MotionCurve, lag_s: float) -> ClockPair | None:
     """Return offset, drift and their standard deviations near an offset; None if it is no clear peak."""
-    if not curve.lags_s[0] <= lag_s <= curve.lags_s[-1]:
+    scores, (least_s, most_s) = curve.scores, curve.scores.lags_s[[0, -1]]
+    if not least_s <= lag_s <= most_s:
         return None
     first, second = curve.signals
-    near = np.arange(
-        max(lag_s - _NEAR_S, curve.lags_s[0]), min(lag_s + _NEAR_S, curve.lags_s[-1]) + 1e-9, _FINE_S
-    )
-    peak = _find_peak(near, curve.at(near), _FINE_S, curve.limb_lag_s)
+    near = np.arange(max(lag_s - _NEAR_S, least_s), min(lag_s + _NEAR_S, most_s) + 1e-9, _FINE_S)
+    peak = _find_peak(near, scores.at(near), _FINE_S, curve.limb_lag_s)
     start_s = max(second.first_step * STEP_S, first.first_step * STEP_S - peak.lag_s)
     end_s = min(
         (second.first_step + second.count) * STEP_S,
@@ -240,7 +224,7 @@ def _refined(curve: MotionCurve, lag_s: float) -> ClockPair | None:
         sigma_s=peak.sigma_s,
         evidence=peak.score,
     )
-    if float(np.interp(peak.lag_s, curve.lags_s, curve.common_s)) >= _MIN_DRIFT_SPAN_S:
+    if float(np.interp(peak.lag_s, scores.lags_s, scores.common_s)) >= _MIN_DRIFT_SPAN_S:
         pair = _with_drift(curve, pair, start_s, end_s)
     is_clear = pair.sigma_s <= _MAX_PAIR_SIGMA_S and abs(pair.offset_s - lag_s) < _NEAR_S
     return pair if is_clear else None
@@ -268,7 +252,7 @@ def _with_drift(curve: MotionCurve, pair: ClockPair, start_s: float, end_s: floa
         ):
             continue
         middles.append(0.5 * (begin + end))
-        curves.append(replace(curve, lags_s=lags, score=found.score).at(pair.offset_s + grid))
+        curves.append(found.at(pair.offset_s + grid))
     if len(middles) < _MIN_WINDOWS:
         return pair
     return _fit_drift(pair, np.array(middles), np.array(curves), grid, curve.limb_lag_s)
@@ -333,9 +317,8 @@ def motion_clocks(paths: Sequence[CameraPath], reference: str) -> MotionClocks:
     starts = {path.camera: path.times_ns[0] * 1e-9 for path in paths if len(path.times_ns)}
     starts.setdefault(reference, 0.0)
     floors = {path.camera: _limb_lag_s(path) for path in paths}
-    solved: JointClocks[ClockPair] = solve_clocks(
-        reference, [pair for pair in pairs if pair is not None], starts, floors
-    )
+    clear = [pair for pair in pairs if pair is not None]
+    solved = solve_clocks(reference, clear, starts, floors, "motion")
     for name in offsets_s:
         clock = solved.clocks.get(name)
         if clock is None:
@@ -389,9 +372,11 @@ def _peak_of(name: str, offsets_s: Mapping[str, float], curves: Sequence[MotionC
     ]
     if not terms:
         return None
-    ends = [known_s + sign * curve.lags_s[[0, -1]] for curve, known_s, sign in terms]
+    ends = [known_s + sign * curve.scores.lags_s[[0, -1]] for curve, known_s, sign in terms]
     grid = np.arange(np.min(ends), np.max(ends) + _GRID_S, _GRID_S)
-    total = sum((curve.at(sign * (grid - known_s)) for curve, known_s, sign in terms), np.zeros(len(grid)))
+    total = sum(
+        (curve.scores.at(sign * (grid - known_s)) for curve, known_s, sign in terms), np.zeros(len(grid))
+    )
     return _find_peak(grid, total, _GRID_S, min(curve.limb_lag_s for curve, _, _ in terms))
 
 

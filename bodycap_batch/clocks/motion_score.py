@@ -43,6 +43,15 @@ class MotionScore:
     common_s: FloatArray
     score: FloatArray
 
+    def at(self, lags_s: FloatArray) -> FloatArray:
+        """Return the score at offsets (K,), seconds; 0 where it is unknown."""
+        from scipy.interpolate import CubicSpline
+
+        out = np.zeros(len(lags_s))
+        inside = (lags_s >= self.lags_s[0]) & (lags_s <= self.lags_s[-1])
+        out[inside] = CubicSpline(self.lags_s, self.score)(lags_s[inside])
+        return out
+
 
 def motion_score(
     first: MotionSignals,

@@ -245,17 +245,13 @@ def _search_starts(track: SoundTrack) -> list[float]:
     parts = min(sum(_SEARCHES), max(1, int(duration / _WINDOW_S)))
     loudness = np.convolve(levels, np.ones(round(_WINDOW_S / 0.1)), "full")[round(_WINDOW_S / 0.1) - 1 :]
     starts = []
-    for low, high in _edges(track.start_s, track.end_s - _WINDOW_S, parts):
+    edges = np.linspace(track.start_s, track.end_s - _WINDOW_S, parts + 1)
+    for low, high in itertools.pairwise(edges.tolist()):
         inside = np.flatnonzero((times >= low) & (times <= high))
         if len(inside) and loudness[inside].max() > 0:
             starts.append(float(times[inside[loudness[inside].argmax()]]))
     order = sorted(range(len(starts)), key=lambda index: (index * 0.618034 + 0.5) % 1.0)
     return [starts[index] for index in order]
-
-
-def _edges(start: float, end: float, parts: int) -> list[tuple[float, float]]:
-    edges = np.linspace(start, end, parts + 1)
-    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 
 
 def _search(
@@ -358,11 +354,8 @@ class _Candidate:
 
 def _is_known(examined: Sequence[_Candidate], lag_s: float) -> bool:
     """Return True if an examined candidate has this offset."""
-    for candidate in examined:
-        near = np.abs(candidate.offsets_s[candidate.agrees] - lag_s) < PEAK_WIDTH_S
-        if abs(candidate.lag_s - lag_s) < PEAK_WIDTH_S or near.any():
-            return True
-    return False
+    found = (np.append(each.offsets_s[each.agrees], each.lag_s) for each in examined)
+    return any((np.abs(offsets_s - lag_s) < PEAK_WIDTH_S).any() for offsets_s in found)
 
 
 def _examine(

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 from bodycap_batch.clocks.container_times import DAY_S, ExpectedOffset
 from bodycap_batch.clocks.joint_offsets import MAX_SIGMAS, JointClocks, connected_cameras
-from bodycap_batch.clocks.pair_offsets import PairOffset
 from bodycap_batch.clocks.sound_evidence import Recording, SoundEvidence
 from bodycap_batch.model.camera_clock import ClockSource
 
@@ -40,7 +39,7 @@ def describe_contradiction(
 
 
 def contradictions_of_sound(
-    name: str, evidence: SoundEvidence, joint: JointClocks[PairOffset], stated_s: float | None
+    name: str, evidence: SoundEvidence, joint: JointClocks, stated_s: float | None
 ) -> Iterator[str]:
     """Yield what contradicts the clock that the sound gives for a camera other than the reference camera.
 
@@ -66,7 +65,7 @@ def contradictions_of_sound(
             )
 
 
-def dropped_pairs(name: str, joint: JointClocks[PairOffset]) -> Iterator[str]:
+def dropped_pairs(name: str, joint: JointClocks) -> Iterator[str]:
     """Yield which pairs of a camera contradict the other pairs."""
     for pair, residual_s in joint.dropped:
         if name in (pair.first, pair.second):
@@ -105,10 +104,10 @@ def reasons_without_clock(name: str, reference: str, evidence: SoundEvidence) ->
 def _gap_s(expected: ExpectedOffset, first: Recording, second: Recording) -> float:
     """Return the time between two recordings according to their files, seconds; 0 if they may overlap."""
     low_s, high_s = expected.limits()
-    if second.first_frame_s + low_s > first.end_s:
-        return second.first_frame_s + expected.offset_s - first.end_s
-    if first.first_frame_s > second.end_s + high_s:
-        return first.first_frame_s - second.end_s - expected.offset_s
+    if second.start.first_frame_s + low_s > first.end_s:
+        return second.start.first_frame_s + expected.offset_s - first.end_s
+    if first.start.first_frame_s > second.end_s + high_s:
+        return first.start.first_frame_s - second.end_s - expected.offset_s
     return 0.0
 
 

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 from bodycap_batch.capture.frame_index import index_videos
 from bodycap_batch.capture.timeline import join_chapters
@@ -15,7 +16,7 @@ from bodycap_batch.clocks.container_times import (
     expected_offset,
     read_container_time,
 )
-from bodycap_batch.clocks.joint_offsets import MAX_DRIFT_PPM, camera_pairs, connected_cameras
+from bodycap_batch.clocks.joint_offsets import MAX_DRIFT_PPM, connected_cameras
 from bodycap_batch.clocks.pair_offsets import PairOffset, measure_channels
 from bodycap_batch.clocks.phase_correlation import PEAK_WIDTH_S
 from bodycap_batch.clocks.sound_track import Recorder, SoundTrack, read_channels, read_sound_track
@@ -33,7 +34,6 @@ class Recording:
         notes: Notes for the user about the sound.
         recorder: Device and encoder of the sound; None without sound.
         start: Start of the recording according to the container.
-        first_frame_s: Time of the first frame on the clock of the camera, seconds.
         end_s: End of the sound, or of the pictures without usable sound, on the clock of the camera, seconds.
         frames: Number of frames.
     """
@@ -44,7 +44,6 @@ class Recording:
     notes: tuple[str, ...]
     recorder: Recorder | None
     start: ContainerTime
-    first_frame_s: float
     end_s: float
     frames: int
 
@@ -107,7 +106,7 @@ def measure_sound(spec: CaptureConfig, threads: int | None = None) -> SoundEvide
             return connected_cameras(reference, [pair for pair in measured.values() if pair.accepted])
 
         reference = spec.reference_camera().name
-        heard = measure_all(camera_pairs([name for name, usable in tracks.items() if usable]))
+        heard = measure_all(list(combinations((name for name, usable in tracks.items() if usable), 2)))
         if len(heard) < len(spec.cameras) and sum(mix.channels > 0 for _, mix in read) > 1:
             # The mixes of several cameras that are heard resemble each other: they need no other channels.
             lost = [
@@ -116,7 +115,7 @@ def measure_sound(spec: CaptureConfig, threads: int | None = None) -> SoundEvide
                 if mix.channels > 1 and (camera.name not in heard or len(heard) == 1)
             ]
             tracks |= zip((mix.camera for _, mix in lost), pool.map(_read_channels, lost), strict=True)
-            pairs = camera_pairs([name for name, usable in tracks.items() if usable])
+            pairs = combinations((name for name, usable in tracks.items() if usable), 2)
             measure_all(
                 [
                     pair
@@ -129,7 +128,7 @@ def measure_sound(spec: CaptureConfig, threads: int | None = None) -> SoundEvide
             recordings=tuple(
                 _with_channel(each, tracks[each.camera], measured.values()) for each in found.recordings
             ),
-            pairs=tuple(measured[pair] for pair in camera_pairs(list(tracks)) if pair in measured),
+            pairs=tuple(measured[pair] for pair in combinations(tracks, 2) if pair in measured),
         )
 
 
@@ -159,15 +158,13 @@ def _read_recording(config: CameraConfig) -> tuple[Recording, SoundTrack]:
     videos = index_videos(config.video)
     times_ns = join_chapters(videos, config.timestamps).times_ns
     track = read_sound_track(config.name, videos, times_ns)
-    first_frame_s = int(times_ns[0]) / 1e9
     recording = Recording(
         camera=config.name,
         sound_start_s=track.start_s if track.pieces else None,
         problem=track.problem,
         notes=track.notes,
         recorder=track.recorder,
-        start=read_container_time(videos, first_frame_s),
-        first_frame_s=first_frame_s,
+        start=read_container_time(videos, int(times_ns[0]) / 1e9),
         end_s=track.end_s if track.pieces else int(times_ns[-1]) / 1e9,
         frames=len(times_ns),
     )

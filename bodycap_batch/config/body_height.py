@@ -32,19 +32,15 @@ def height_from_text(text: str | float) -> float:
         JobError: The text is no height, or no person has this height.
     """
     metres = _metres(str(text).strip().lower())
-    if metres is None:
-        raise JobError(
-            f"{str(text)[:40]!r} is not a body height",
-            field="height_m",
-            hint="give the height in metres (1.75), in centimetres (175) or in feet and inches (5'9\")",
-        )
-    if not MIN_HEIGHT_M <= metres <= MAX_HEIGHT_M:
-        raise JobError(
-            f"a body height of {metres:g} m is not plausible",
-            field="height_m",
-            hint="give the height in metres (1.75), in centimetres (175) or in feet and inches (5'9\")",
-        )
-    return metres
+    if metres is not None and MIN_HEIGHT_M <= metres <= MAX_HEIGHT_M:
+        return metres
+    raise JobError(
+        f"{str(text)[:40]!r} is not a body height"
+        if metres is None
+        else f"a body height of {metres:g} m is not plausible",
+        field="height_m",
+        hint="give the height in metres (1.75), in centimetres (175) or in feet and inches (5'9\")",
+    )
 
 
 def describe_height(metres: float) -> str:

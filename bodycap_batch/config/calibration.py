@@ -27,19 +27,17 @@ from bodycap_batch.config.foreign_calibrations import (
     parse_calibration,
 )
 from bodycap_batch.config.mounts import mount_of
+from bodycap_batch.config.options import Options
 from bodycap_batch.config.yaml_source import MAX_BYTES
 from bodycap_batch.core.errors import CaptureError
-from bodycap_batch.model.camera import CAMERA_MODELS, CV2_PIXEL_OFFSET_PX, Camera, parameter_count
+from bodycap_batch.model.camera import (
+    CAMERA_MODELS,
+    CV2_PIXEL_OFFSET_PX,
+    Camera,
+    focal_count,
+    parameter_count,
+)
 
-_CENTRE_INDEX = {
-    "SIMPLE_PINHOLE": 1,
-    "SIMPLE_RADIAL": 1,
-    "RADIAL": 1,
-    "SIMPLE_RADIAL_FISHEYE": 1,
-    "RADIAL_FISHEYE": 1,
-}
-"""Index, in a camera model's parameters, of the x coordinate of the principal point. The table lists the
-models with one focal length. For all other models the index is 2."""
 _FOCAL_RANGE = (0.02, 50.0)
 """Minimum and maximum plausible focal length, as a ratio to the long side of the image. Derivation: a fisheye
 lens that shows 180° has about 0.3; a telephoto lens of 1000 mm on a 35 mm camera has 28. Values outside the
@@ -126,13 +124,11 @@ class CalibratedWith(BaseModel):
     notes: tuple[str, ...] = Field((), description="reasons why the calibration may be wrong")
 
 
-class Calibration(BaseModel):
+class Calibration(Options):
     """Intrinsics of a camera at the size of its calibration images.
 
     The images are upright, as a video player shows them.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     model: str = Field(description="COLMAP camera model")
     params: tuple[Annotated[float, AllowInfNan()], ...] = Field(
@@ -181,7 +177,7 @@ class Calibration(BaseModel):
 
     def implausible_value(self) -> ImplausibleValue | None:
         """Return the first parameter that no camera has, or a too large error; None if all is plausible."""
-        centre = _CENTRE_INDEX.get(self.model, 2)
+        centre = focal_count(self.model)
         for index, (name, value) in enumerate(zip(_parameter_names(self.model), self.params, strict=True)):
             low, high, what, unit = self._plausible_range(index, centre)
             if not (math.isfinite(value) and low <= value <= high):
@@ -219,14 +215,14 @@ class Calibration(BaseModel):
         """Return the camera model at the image size of the calibration, with COLMAP's pixel origin."""
         params = list(self.params)
         if self.pixel_origin == "opencv":
-            index = _CENTRE_INDEX.get(self.model, 2)
+            index = focal_count(self.model)
             params[index] += CV2_PIXEL_OFFSET_PX
             params[index + 1] += CV2_PIXEL_OFFSET_PX
         return Camera(model=self.model, width_px=self.width, height_px=self.height, params=params)  # type: ignore[arg-type]
 
 
 def _parameter_names(model: str) -> list[str]:
-    centre = _CENTRE_INDEX.get(model, 2)
+    centre = focal_count(model)
     names = [*(("f",) if centre == 1 else ("fx", "fy")), "cx", "cy"]
     return [*names, *(name for name, _ in _DISTORTION.get(model, ()))]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 from collections.abc import Callable, Sequence
@@ -115,7 +116,7 @@ def videos_in(folder: Path) -> list[Path]:
     """
     try:
         entries = visible_entries(folder)
-        videos = [path for path in entries if is_video(path) or (path.is_dir() and _has_chapters(path))]
+        videos = [path for path in entries if is_video(path) or (path.is_dir() and has_chapters(path))]
     except OSError as error:
         raise CaptureError(
             f"the folder cannot be read ({error})", path=folder, hint="correct the path"
@@ -134,8 +135,11 @@ def _content_instead(entries: Sequence[Path]) -> str:
     """Return what a folder without videos contains, as the end of a sentence; "" if it is not known."""
     kinds = (("photos", PHOTO_SUFFIXES), ("an archive", ARCHIVE_SUFFIXES))
     found = [name for name, suffixes in kinds if any(path.suffix.lower() in suffixes for path in entries)]
+    inner = {path.name: readable_entries(path) for path in entries if path.is_dir()}
     deeper = [
-        path.name for path in entries if path.is_dir() and any(map(_has_video_below, _folders_in(path)))
+        name
+        for name, paths in inner.items()
+        if any(is_video(video) for path in paths if path.is_dir() for video in readable_entries(path))
     ]
     found += [f"the folder {name} with folders of videos" for name in deeper[:1]]
     return f"; it contains {' and '.join(found)}" if found else ""
@@ -147,18 +151,15 @@ def _first_step(entries: Sequence[Path]) -> str:
     return "unpack the archive; " if has_archive else ""
 
 
-def _folders_in(folder: Path) -> list[Path]:
+def readable_entries(folder: Path) -> list[Path]:
+    """Return the entries of a folder, sorted; none if it cannot be read.
+
+    That is reported where the folder is used.
+    """
     try:
-        return [path for path in folder.iterdir() if path.is_dir()]
+        return sorted(folder.iterdir()) if os.access(folder, os.R_OK | os.X_OK) else []
     except OSError:
         return []
-
-
-def _has_video_below(folder: Path) -> bool:
-    try:
-        return any(map(is_video, folder.iterdir()))
-    except OSError:
-        return False
 
 
 def real_path(path: Path) -> Path:
@@ -192,7 +193,8 @@ def is_system_folder(name: str) -> bool:
     return name.startswith(_SYSTEM_MARKS)
 
 
-def _has_chapters(folder: Path) -> bool:
+def has_chapters(folder: Path) -> bool:
+    """Return True if a folder holds videos, and no results."""
     return any(map(is_video, folder.iterdir())) and not (folder / RUN_FILE).is_file()
 
 

@@ -48,8 +48,6 @@ from bodycap_batch.config.videos_beside import VideosBeside, find_videos_beside
 from bodycap_batch.config.yaml_source import Location, YamlSource, dotted, read_yaml
 from bodycap_batch.core.errors import CaptureError, JobError
 
-_LISTS = ("video", "timestamps")
-"""Names of the fields of a camera in which a job file may give a single path instead of a list of paths."""
 RESULTS = "out"
 """Name of the folder for results beside a job. The folder of one job's results is a subfolder of it."""
 
@@ -58,17 +56,16 @@ Prepare = Callable[[Mapping[str, Any], Path, Path], None]
 for the videos, and the folder for the results of the job."""
 
 
-def results_of_job(path: Path, overrides: Overrides | None = None) -> Path:
+def results_of_job(path: Path) -> Path:
     """Return the folder for the results of a job. Of a job file, only the name and the folder are read.
 
     Args:
         path: Path of a YAML file or of a folder of videos.
-        overrides: Values of the command line.
 
     Raises:
         JobError: The file is no YAML file, or there is none.
     """
-    return _source_at(path.resolve(), None, Limits()).stated_results(overrides or Overrides())
+    return _source_at(path.resolve(), None, Limits()).stated_results(Overrides())
 
 
 def load_job(
@@ -248,7 +245,7 @@ class _StatedJob:
         uses_folder: True if the job uses the videos and the calibration in its folder.
         is_alone: True for a job file that another user submitted without a folder.
         beside: The videos in the folder that the job file does not list.
-        placed: Where the place of a camera comes from if not from the job file, by camera name.
+        placed: Where the place of a camera comes from if the job states it, by camera name.
     """
 
     source: _Source
@@ -269,43 +266,37 @@ def _stated_job(source: _Source, overrides: Overrides, *, alone: bool) -> _State
         alone: True for a job file that another user submitted without a folder.
     """
     stated = _stated_without_places(source, overrides, alone=alone)
-    listed = stated.job.capture.cameras
-    placed = {camera.name: given[1] for camera in listed if (given := overrides.place_of(camera)) is not None}
-    cameras = tuple(map(overrides.mounted, listed))
-    overrides.require_used(listed)
-    capture = stated.job.capture.model_copy(update={"cameras": cameras})
+    mounted = [overrides.mounted(camera) for camera in stated.job.capture.cameras]
+    placed = {camera.name: source for camera, source in mounted}
+    overrides.require_used(stated.job.capture.cameras)
+    capture = stated.job.capture.model_copy(update={"cameras": tuple(camera for camera, _ in mounted)})
     return replace(stated, job=stated.job.model_copy(update={"capture": capture}), placed=placed)
 
 
 def _stated_without_places(source: _Source, overrides: Overrides, *, alone: bool) -> _StatedJob:
-    if source.file is None:
-        refuse_missing_cameras(source.path)
-        job = _validated({"capture": folder_capture(source.path, overrides.is_known)}, source)
-        return _StatedJob(source=source, job=job, stated=_without_cameras(job.capture), uses_folder=True)
-    stated_data = _top_mapping(source.file)
-    data = stated_data if alone else _with_folder_capture(stated_data, source.folder, overrides)
+    stated_data = {} if source.file is None else _top_mapping(source.file)
+    data = stated_data if alone else _with_folder_capture(stated_data, source, overrides)
     job = _validated(data, source)
     if data is not stated_data:
-        return _StatedJob(source=source, job=job, stated=_without_cameras(job.capture), uses_folder=True)
+        stated = job.capture.model_copy(update={"cameras": ()})
+        return _StatedJob(source=source, job=job, stated=stated, uses_folder=True)
     uses_folder = not alone and source.is_folder and not (source.folder / RUN_FILE).is_file()
     stated, beside = job.capture, VideosBeside()
     # The videos of a synthetic capture exist only after they have been rendered, so they are not looked for.
     if uses_folder and not stated.cameras_only and stated.synthetic is None:
-        are_found = bool(stated.places)
-        beside = find_videos_beside(
-            source.path, stated.cameras, lambda name: are_found or overrides.is_known(name)
-        )
+        beside = find_videos_beside(source.path, stated.cameras, _knows(data, overrides))
         if beside.cameras:
-            listed = _with_lists(data)["capture"]
-            capture = {**listed, "cameras": [*listed["cameras"], *beside.cameras]}
+            capture = {**data["capture"], "cameras": [*data["capture"]["cameras"], *beside.cameras]}
             job = _validated({**data, "capture": capture}, source)
     return _StatedJob(
         source=source, job=job, stated=stated, uses_folder=uses_folder, is_alone=alone, beside=beside
     )
 
 
-def _without_cameras(capture: CaptureConfig) -> CaptureConfig:
-    return capture.model_copy(update={"cameras": ()})
+def _knows(data: Mapping[str, Any], overrides: Overrides) -> Callable[[str], bool]:
+    """Return a function that returns True if the place of a video is known, or found by the run."""
+    are_found = bool(data.get("capture", {}).get("places"))
+    return lambda name: are_found or overrides.is_known(name)
 
 
 def _resolved_job(
@@ -327,14 +318,14 @@ def _resolved_job(
             error.message += f"; also {dotted(found.location)}: {found.message}"
         raise error
     if policy is not None:
-        policy.require_named(job, base)
+        policy.require_files(job, base)
     if job.capture.synthetic is not None:
         _prepare_synthetic(job, stated, overrides, prepare)
     _require_plausible_calibrations(job, source)
     if stated.uses_folder:
         job = job.model_copy(update={"capture": with_found_calibrations(job.capture, base)})
         if policy is not None:  # before a calibration is read
-            policy.require_named(job, base)
+            policy.require_files(job, base)
     cameras = [
         resolved_camera(index, job.capture, stated.stated, base, stated.placed)
         for index in range(len(job.capture.cameras))
@@ -343,7 +334,7 @@ def _resolved_job(
     if policy is None:
         _require_apart(resolved, source.path)
     else:  # the folder of the results is not checked, because the operator chooses it
-        policy.require_resolved(resolved)
+        policy.require_files(resolved, base)
     return LoadedJob(
         job=resolved,
         origins={camera.config.name: camera.origins for camera in cameras},
@@ -352,8 +343,7 @@ def _resolved_job(
         calibration_files=frozenset(
             camera.calibration_file for camera in cameras if camera.calibration_file is not None
         ),
-        reasons=stated.beside.reasons,
-        unreadable=stated.beside.unreadable,
+        beside=stated.beside,
         unlisted=_reason_of_unlisted(stated),
         warnings=(
             *stated.beside.warnings,
@@ -466,25 +456,28 @@ def _top_mapping(source: YamlSource) -> dict[str, Any]:
     return source.data
 
 
-def _with_folder_capture(data: dict[str, Any], folder: Path, overrides: Overrides) -> dict[str, Any]:
-    """Return the data of a job file. If no cameras are listed, add the videos in the job file's folder.
+def _with_folder_capture(data: dict[str, Any], source: _Source, overrides: Overrides) -> dict[str, Any]:
+    """Return the data of a job. If no cameras are listed, add the videos in the folder of the job.
 
-    The cameras are named after these videos, as for a folder without a job file. Data with an unknown key are
-    returned unchanged, because the unknown key may be a misspelt ``cameras``.
+    A folder without a job file is a job without data. Data with an unknown key are returned unchanged,
+    because the unknown key may be a misspelt ``cameras``.
     """
     capture = data.get("capture", {})
     if not isinstance(capture, dict) or "cameras" in capture or capture.get("cameras_only") is True:
         return data
     if not (data.keys() <= Job.model_fields.keys() and capture.keys() <= CaptureConfig.model_fields.keys()):
         return data
-    refuse_missing_cameras(folder)
+    refuse_missing_cameras(source.folder)
     try:
-        videos_in(folder)
-    except CaptureError:  # no videos here: the validation reports the missing cameras
-        return data
-    are_found = bool(capture.get("places"))
-    found = folder_capture(folder, lambda name: are_found or overrides.is_known(name))
-    return {**data, "capture": {**found, **capture}}
+        videos_in(source.folder)
+    except CaptureError:
+        if source.file is None:
+            raise
+        return data  # no videos here: the validation reports the missing cameras
+    return {
+        **data,
+        "capture": {**folder_capture(source.folder, _knows(data, overrides)), **capture},
+    }
 
 
 def _validated(data: dict[str, Any], source: _Source) -> Job:
@@ -494,23 +487,9 @@ def _validated(data: dict[str, Any], source: _Source) -> Job:
     for a number.
     """
     try:
-        return Job.model_validate_json(json.dumps(_with_lists(data)), strict=True)
+        return Job.model_validate_json(json.dumps(data), strict=True)
     except ValidationError as error:
         raise source.error(problems_of(error, Job, data)) from error
-
-
-def _with_lists(data: dict[str, Any]) -> dict[str, Any]:
-    """Replace a single path by a list with one path, because the strict validation does not convert it."""
-    capture = data.get("capture")
-    if not isinstance(capture, dict) or not isinstance(capture.get("cameras"), list):
-        return data
-    cameras = [
-        {key: [v] if key in _LISTS and isinstance(v, str) else v for key, v in camera.items()}
-        if isinstance(camera, dict)
-        else camera
-        for camera in capture["cameras"]
-    ]
-    return {**data, "capture": {**capture, "cameras": cameras}}
 
 
 def _with_overrides(job: Job, overrides: Overrides) -> Job:

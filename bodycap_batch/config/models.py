@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag
 
 from bodycap_batch.config.body_height import MAX_HEIGHT_M, MIN_HEIGHT_M, height_from_text
 from bodycap_batch.config.bounds import (
@@ -27,6 +27,7 @@ from bodycap_batch.config.options import (
     KeyframeOptions,
     MapOptions,
     MergeOptions,
+    Options,
     RegistrationOptions,
     TelemetryOptions,
 )
@@ -51,12 +52,6 @@ MAX_NAME_LENGTH = 100
 Evidence: none."""
 _MAX_FRAME = 10**8
 """Maximum number of a frame of a skeleton file: a day of motion at the maximum rate has 86 million frames."""
-
-
-class _Block(BaseModel):
-    """Base class of the job's blocks: immutable; unknown keys, NaN and infinity are refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 def _calibration_kind(value: object) -> str:
@@ -93,6 +88,11 @@ def _none_if_auto(value: object) -> object:
     return None if value == "auto" else value
 
 
+def _as_tuple(value: object) -> object:
+    """Return a tuple for a single path and for a list of paths; else the value unchanged."""
+    return (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
+
+
 AnyCalibration = Annotated[
     Annotated[Calibration, Tag("inline")]
     | Annotated[Literal["auto"], Tag("auto")]
@@ -104,11 +104,12 @@ Seconds = Annotated[float, Field(ge=-MAX_TIME_S, le=MAX_TIME_S)]
 _Drift = Annotated[float, Field(ge=-MAX_DRIFT_PPM, le=MAX_DRIFT_PPM)]
 _Component = Annotated[float, Field(ge=-_MAX_ROTATION, le=_MAX_ROTATION)]
 _Metres = Annotated[float, Field(ge=-MAX_REACH_M, le=MAX_REACH_M)]
+_Paths = Annotated[tuple[Path, ...], BeforeValidator(_as_tuple)]
 Row = tuple[_Component, _Component, _Component, _Metres]
 Activity = Literal["walk", "generic"]
 
 
-class MountPose(_Block):
+class MountPose(Options):
     """Pose of a camera relative to the joint of its bone: x_in_joint = rotation · x_in_cam + translation."""
 
     translation_m: tuple[_Metres, _Metres, _Metres]
@@ -125,11 +126,11 @@ _FILE_FIELDS = ("video", "timestamps", "calibration", "samples", "mask")
 """Names of the fields of a camera that hold paths."""
 
 
-class CameraConfig(_Block):
+class CameraConfig(Options):
     """One camera of the capture. Loaded jobs hold absolute paths and list all chapters and sidecar files."""
 
     name: str = Field(max_length=64, description="name of the camera; the camera's results have this name")
-    video: tuple[Path, ...] = Field(
+    video: _Paths = Field(
         min_length=1, description="a video file, a folder of chapters, or a list of chapters"
     )
     mount: str | None = Field(
@@ -173,7 +174,7 @@ class CameraConfig(_Block):
         description="field of view along the long side of the picture, in degrees; `calibration: "
         "auto` starts from this value",
     )
-    timestamps: tuple[Path, ...] = Field(
+    timestamps: _Paths = Field(
         (),
         description="file with one time for each frame, in seconds (other units are recognised); one file "
         "for all chapters, or one file for each chapter",
@@ -256,7 +257,7 @@ class CameraConfig(_Block):
         return (*self.video, *self.timestamps, *(() if self.mask is None else (self.mask,)))
 
 
-class CaptureConfig(_Block):
+class CaptureConfig(Options):
     """The videos of one recording."""
 
     cameras: tuple[CameraConfig, ...] = Field(
@@ -329,7 +330,7 @@ class CaptureConfig(_Block):
         return [cameras for cameras in by_role.values() if len(cameras) > 1]
 
 
-class Job(_Block):
+class Job(Options):
     """A job: everything that a run needs. Without named cameras, the videos in the job's folder are used."""
 
     capture: CaptureConfig

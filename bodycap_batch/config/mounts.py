@@ -20,19 +20,7 @@ _SIDED_SPELLINGS = {
     "Foot": ("foot", "shoe"),
     "Shoulder": ("shoulder", "clavicle"),
 }
-_MOUNT_NAME = {
-    "Spine1": "torso",
-    "Head": "head",
-    "Hips": "hips",
-    "Spine": "spine",
-    "Hand": "palm",
-    "Arm": "upper_arm",
-    "ForeArm": "forearm",
-    "UpLeg": "thigh",
-    "Leg": "shin",
-    "Foot": "foot",
-    "Shoulder": "shoulder",
-}
+"""Spellings of each place, the preferred one first, by role of the bone without its side."""
 _SIDES = {"left": "Left", "right": "Right", "l": "Left", "r": "Right"}
 
 
@@ -40,11 +28,11 @@ def _names() -> Iterator[tuple[str, tuple[str, str]]]:
     """Yield each known spelling of a mount's name with the pair (preferred name, role of the bone)."""
     for role, spellings in _CENTRAL_SPELLINGS.items():
         for spelling in spellings:
-            yield spelling, (_MOUNT_NAME[role], role)
+            yield spelling, (spellings[0], role)
     for part, spellings in _SIDED_SPELLINGS.items():
         for side, prefix in _SIDES.items():
             for spelling in spellings:
-                found = (f"{prefix.lower()}_{_MOUNT_NAME[part]}", prefix + part)
+                found = (f"{prefix.lower()}_{spellings[0]}", prefix + part)
                 yield f"{side}_{spelling}", found
                 yield f"{spelling}_{side}", found
 
@@ -55,9 +43,9 @@ MOUNT_NAMES = tuple(dict.fromkeys(mount for mount, _ in _MOUNT_BY_SPELLING.value
 """The preferred name of each place on the body where a camera can be mounted, for messages and help texts."""
 
 PLACES_TEXT = (
-    ", ".join(_MOUNT_NAME[role] for role in _CENTRAL_SPELLINGS)
+    ", ".join(spellings[0] for spellings in _CENTRAL_SPELLINGS.values())
     + "; and with left_ or right_ before it "
-    + ", ".join(_MOUNT_NAME[part] for part in _SIDED_SPELLINGS)
+    + ", ".join(spellings[0] for spellings in _SIDED_SPELLINGS.values())
 )
 """All places in few words, for messages."""
 

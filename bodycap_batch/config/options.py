@@ -45,7 +45,7 @@ maximum is the Nyquist frequency of the maximum rate."""
 
 
 class Options(BaseModel):
-    """Base class of all blocks of options: immutable; unknown keys, NaN and infinity are refused."""
+    """Base class of all blocks of a job: immutable; unknown keys, NaN and infinity are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

@@ -18,6 +18,7 @@ from bodycap_batch.config.folder import (
 )
 from bodycap_batch.config.models import Job
 from bodycap_batch.config.sample_files import SAMPLE_SUFFIXES
+from bodycap_batch.config.videos_beside import VideosBeside
 
 Source = Literal[
     "command line",
@@ -126,8 +127,7 @@ class LoadedJob:
             are in it. Otherwise None.
         job_file: The job file; None for a folder without a job file.
         calibration_files: The calibration files that were read.
-        reasons: For each file or folder in the capture's folder that is known to be unused, the reason.
-        unreadable: For each video in the capture's folder that is not used and cannot be opened, the reason.
+        beside: The files and folders in the capture's folder that are known to be unused.
         unlisted: Reason why any other video in the capture's folder is not used.
         warnings: Sentences about what the user probably did not intend.
         no_body: Sentence that explains why no body is computed although the job does not say
@@ -139,8 +139,7 @@ class LoadedJob:
     folder: Path | None
     job_file: Path | None
     calibration_files: frozenset[Path]
-    reasons: Mapping[Path, str]
-    unreadable: Mapping[Path, str]
+    beside: VideosBeside
     unlisted: str
     warnings: tuple[str, ...]
     no_body: str
@@ -170,8 +169,8 @@ class LoadedJob:
         return frozenset(files | self.calibration_files)
 
     def _unused_in(self, path: Path, used: frozenset[Path]) -> list[UnusedFile]:
-        if path in self.reasons:
-            return [self._unused(path, self.reasons[path])]
+        if path in self.beside.reasons:
+            return [self._unused(path, self.beside.reasons[path])]
         target = real_path(path)
         if target in used:
             return []
@@ -189,7 +188,7 @@ class LoadedJob:
     def _unused_beside_chapters(self, folder: Path, used: frozenset[Path]) -> list[UnusedFile]:
         """Return the unused files of a folder that holds files of the job, without its own folders."""
         return [
-            self._unused(path, self.reasons.get(path, self._reason(path)))
+            self._unused(path, self.beside.reasons.get(path, self._reason(path)))
             for path in sorted(folder.iterdir())
             if not path.name.startswith(".") and path.is_file() and real_path(path) not in used
         ]

@@ -97,23 +97,23 @@ class Overrides:
         given = _place_of((name,), self.mounts) or _place_of((name,), self.last_mounts)
         return bool(self.places) or given is not None or mount_of(name) is not None
 
-    def mounted(self, camera: CameraConfig) -> CameraConfig:
-        """Return a camera with the place that is given for it, or unchanged.
+    def mounted(self, camera: CameraConfig) -> tuple[CameraConfig, Source]:
+        """Return a camera with the place that is given for it, or unchanged, and where its place comes from.
 
         Raises:
             JobError: The place is unknown.
         """
         given = self.place_of(camera)
         if given is None:
-            return camera
-        place, _ = given
+            return camera, "job file"
+        place, source = given
         if mount_of(place) is None:
             raise JobError(
                 f"there is no place {place[:40]!r} on the body",
                 field="--camera",
                 hint=f"use one of {', '.join(MOUNT_NAMES)}",
             )
-        return camera.model_copy(update={"mount": place, "mount_source": None, "segment": None})
+        return camera.model_copy(update={"mount": place, "mount_source": None, "segment": None}), source
 
     def require_used(self, cameras: Sequence[CameraConfig]) -> None:
         """Check that each name in `mounts` belongs to a camera. Raises `JobError`."""

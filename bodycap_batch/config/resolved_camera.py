@@ -70,7 +70,7 @@ def resolved_camera(
         stated: The capture as the job file states it. It has fewer cameras if videos beside the job file were
             added. If there is no job file, it has no cameras.
         base: Folder to which the paths of the capture are relative.
-        placed: Where the place of a camera comes from if not from the job file, by camera name.
+        placed: Where the place of a camera comes from if the job states it, by camera name.
 
     Raises:
         CaptureError: A calibration cannot be used, a folder holds no video, or the number of timestamp files
@@ -117,11 +117,13 @@ def resolved_camera(
         samples=_file_origin(
             () if config.samples is None else (config.samples,), is_stated=camera.samples is not None
         ),
-        clock_offset=_offset_in_file(entry, file, is_stated=is_stated)
-        if camera.offset_s is None and entry is not None and entry.offset_s is not None
-        else _clock_origin(camera, capture, camera.offset_s, "s"),
+        clock_offset=_clock_origin(camera, capture, camera.offset_s, "s")
+        if camera.offset_s is not None or file is None or entry is None or entry.offset_s is None
+        else Origin(source="job file", value=f"{entry.offset_s:g} s in {file.name}")
+        if is_stated
+        else Origin(source="calib.json", value=f"{entry.offset_s:g} s"),
         clock_drift=_clock_origin(camera, capture, camera.drift_ppm, "ppm"),
-        mount=_mount_origin(config, capture.places, placed.get(config.name, "job file")),
+        mount=_mount_origin(config, capture.places, placed[config.name]),
         mount_pose=Origin(source="default", value="typical of the place")
         if camera.joint_from_cam is None
         else Origin(source="job file", value="measured"),
@@ -152,13 +154,6 @@ def _file_origin(files: tuple[Path, ...], *, is_stated: bool) -> Origin | None:
     """Return the origin of files that lie beside the video or that the job names; None if there are none."""
     source: Source = "job file" if is_stated else "sidecar file"
     return Origin(source=source, value=_file_names(files)) if files else None
-
-
-def _offset_in_file(entry: CalibrationEntry, file: Path | None, *, is_stated: bool) -> Origin:
-    """Return the origin of a clock offset in a calibration file, which the job may name."""
-    if is_stated and file is not None:
-        return Origin(source="job file", value=f"{entry.offset_s:g} s in {file.name}")
-    return Origin(source="calib.json", value=f"{entry.offset_s:g} s")
 
 
 def _clock_origin(camera: CameraConfig, capture: CaptureConfig, stated: float | None, unit: str) -> Origin:

@@ -27,11 +27,11 @@ class PathPolicy:
     folder: Path | None
     roots: tuple[Path, ...] = ()
 
-    def require_named(self, job: Job, base: Path) -> None:
-        """Check the paths that a job names, before any file is read.
+    def require_files(self, job: Job, base: Path) -> None:
+        """Check the paths that a job names, and those of a resolved job, with chapters and sidecar files.
 
         Args:
-            job: A validated job with the paths as given in its file.
+            job: A validated job.
             base: Folder that relative paths start from.
 
         Raises:
@@ -47,15 +47,6 @@ class PathPolicy:
                     hint=self._hint(),
                 )
             self.require(base / path, field)
-
-    def require_resolved(self, job: Job) -> None:
-        """Check every file of a resolved job, including the chapters and sidecar files that were found.
-
-        Raises:
-            JobError: A file is outside the allowed folders, for example because of a symbolic link.
-        """
-        for place, path in job.files():
-            self.require(path, dotted(place))
 
     def require(self, path: Path, field: str | None = None) -> None:
         """Check one path; symbolic links are followed.

@@ -8,7 +8,6 @@ attributes, indexes. Such a file is hidden, or lies in a folder of the system.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from bodycap_batch.config.folder import (
     VIDEO_SUFFIXES,
     is_system_folder,
     is_video,
+    readable_entries,
     shown_name,
 )
 from bodycap_batch.config.mounts import mount_of
@@ -128,8 +128,8 @@ def refuse_missing_cameras(folder: Path, listed: Collection[Path] = ()) -> None:
     Raises:
         CaptureError: There is such a file.
     """
-    inner = [path for path in _entries(folder) if path.is_dir() and _may_hold_copies(path)]
-    paths = [path for place in (folder, *inner) for path in _entries(place) if path.is_file()]
+    inner = [path for path in readable_entries(folder) if path.is_dir() and _may_hold_copies(path)]
+    paths = [path for place in (folder, *inner) for path in readable_entries(place) if path.is_file()]
     for found in unfinished_files((path, path.relative_to(folder).as_posix()) for path in paths):
         if found.lacks_video and found.path not in listed:
             raise CaptureError(
@@ -149,7 +149,7 @@ def _videos_without_suffix(folder: Path) -> Iterator[Path]:
 
     Videos that are there with a suffix are omitted: cameras write small copies beside them.
     """
-    entries = [path for path in _entries(folder) if not path.name.startswith(".")]
+    entries = [path for path in readable_entries(folder) if not path.name.startswith(".")]
     stems = {path.stem.lower() for path in entries if is_video(path) or path.is_dir()}
     for path in entries:
         is_known = path.suffix.lower() in VIDEO_SUFFIXES | _SIDECAR_SUFFIXES or path.stem.lower() in stems
@@ -162,21 +162,16 @@ def unreadable_videos(path: Path) -> dict[Path, str]:
 
     A video cannot be opened if its structure shows that no frame can be read.
     """
-    videos = filter(is_video, _entries(path) if path.is_dir() else [path])
+    videos = filter(is_video, readable_entries(path) if path.is_dir() else [path])
     parts = {video: missing_part(video, VIDEO_SUFFIXES) for video in videos}
     return {video: part.text for video, part in parts.items() if part is not None and not part.readable_bytes}
 
 
 def _may_hold_copies(folder: Path) -> bool:
     """Return True for the folder of a camera, a hidden folder and a download that is a folder."""
-    entries = _entries(folder)
+    entries = readable_entries(folder)
     is_named = folder.name.startswith(".") or names_video(folder.name) or mount_of(folder.name) is not None
     return folder / RUN_FILE not in entries and (is_named or any(map(is_video, entries)))
-
-
-def _entries(folder: Path) -> list[Path]:
-    """Return the entries of a folder; none if it may not be read, which is reported where it is used."""
-    return sorted(folder.iterdir()) if os.access(folder, os.R_OK | os.X_OK) else []
 
 
 def _relevant(files: Iterable[tuple[Path, str]]) -> list[tuple[Path, str, _ParsedName, bool]]:

@@ -14,6 +14,7 @@ from bodycap_batch.config.folder import (
     Recording,
     camera_block,
     grouped_recordings,
+    has_chapters,
     is_video,
     real_path,
     shown_name,
@@ -137,7 +138,7 @@ def _candidates(folder: Path, listed: Sequence[CameraConfig], found: VideosBesid
             candidates.append(path)
         elif path.is_dir():
             try:
-                has_video = any(map(is_video, path.iterdir())) and not (path / RUN_FILE).is_file()
+                has_video = has_chapters(path)
             except OSError as error:
                 found.leave_out(
                     [path],
@@ -160,11 +161,12 @@ def _belongs_to_listed_camera(
     folder: Path, paths: Sequence[Path], listed: Sequence[CameraConfig], found: VideosBeside
 ) -> bool:
     """Return True if a recording belongs to a listed camera; record its videos that are not listed."""
-    owners: dict[Path, CameraConfig] = {}
-    for path in paths:
-        for camera in listed:
-            if any(_is_part_of(path, folder / video) for video in camera.video):
-                owners[path] = camera
+    owners = {
+        path: camera
+        for path in paths
+        for camera in listed
+        if any(_is_part_of(path, folder / video) for video in camera.video)
+    }
     if not owners:
         return False
     owner = next(iter(owners.values()))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -62,6 +62,10 @@ class ClockRelation:
     def is_known(self) -> bool:
         """True if the offset is known."""
         return self.source != "none"
+
+    def values(self) -> dict[str, Any]:
+        """Return the fields of a relation, without those of a derived class, by name."""
+        return {each.name: getattr(self, each.name) for each in fields(ClockRelation)}
 
     def sigma_at(self, camera_s: float) -> float:
         """Return the standard deviation of the common time at a camera time, seconds.
@@ -132,9 +136,9 @@ class CaptureClocks:
         """Return the clocks of the cameras with a known frame timing, by camera name."""
         clocks = {}
         for name, timing in timings.items():
-            relation = self.cameras.get(name, ClockRelation())
-            parts = {each.name: getattr(relation, each.name) for each in fields(ClockRelation)}
             clocks[name] = CameraClock(
-                nominal_fps=timing.nominal_fps, rolling_shutter_s=timing.rolling_shutter_s, **parts
+                nominal_fps=timing.nominal_fps,
+                rolling_shutter_s=timing.rolling_shutter_s,
+                **self.cameras.get(name, ClockRelation()).values(),
             )
         return clocks

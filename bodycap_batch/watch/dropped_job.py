@@ -227,7 +227,7 @@ def _require_readable_videos(loaded: LoadedJob) -> None:
     Videos that the job leaves out with a warning are checked, too: nobody reads the warning before the
     result is there.
     """
-    found = dict(loaded.unreadable)
+    found = dict(loaded.beside.unreadable)
     for path in (path for camera in loaded.job.capture.cameras for path in camera.video):
         # FFmpeg knows more kinds of video than the structure of a file shows.
         found.update({video: why for video, why in unreadable_videos(path).items() if why != NO_VIDEO})

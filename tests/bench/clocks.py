@@ -224,7 +224,7 @@ def capture_lines(data: Path) -> list[str]:
         for clock in estimates.cameras:
             if clock.camera == estimates.reference:
                 continue
-            if clock.offset_s is None or clock.sigma_s is None:
+            if not clock.is_known:
                 lines.append(f"{folder.name} {clock.camera}: none: {', '.join(clock.reasons)}")
                 continue
             error = clock.offset_s - (offsets[clock.camera] - offsets[estimates.reference])

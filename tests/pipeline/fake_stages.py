@@ -146,7 +146,7 @@ def heard(options: Json, arguments: Json, files: Path) -> None:
     recordings = [
         {
             "camera": camera["name"], "sound_start_s": None, "problem": "the video has no sound", "notes": [],
-            "recorder": None, "start": start, "first_frame_s": 0.0, "end_s": 1.0, "frames": 20,
+            "recorder": None, "start": start, "end_s": 1.0, "frames": 20,
         }
         for camera in arguments["capture"]["config"]["cameras"]
     ]  # fmt: skip

@@ -70,7 +70,7 @@ def _contradicted_clocks(trajectories: list[Trajectory]) -> set[str]:
         for name, role in ROLES.items()
     )
     spec = CaptureConfig(cameras=cameras)
-    unknown = tuple(ClockEstimate(camera=name, offset_s=None, sigma_s=None, source="none") for name in ROLES)
+    unknown = tuple(ClockEstimate(camera=name) for name in ROLES)
     estimates = ClockEstimates(reference="torso", cameras=unknown)
     motion = clocks_from_paths(trajectories, ROLES, "torso")
     stated_s = stated_offsets(spec, "torso")

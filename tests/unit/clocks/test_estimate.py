@@ -76,7 +76,7 @@ def test_offsets_are_relative_to_the_torso(estimates):
 
 def test_a_second_take_and_a_silent_camera_have_no_clock(estimates):
     other = estimates.camera("right_palm")
-    assert (other.source, other.offset_s, other.sigma_s) == ("none", None, None)
+    assert not other.is_known
     assert any("with torso" in reason for reason in other.reasons)
     assert any("2.5 days apart" in reason for reason in other.reasons)
     assert estimates.camera("left_thigh").reasons == ("the video has no sound",)
@@ -85,20 +85,20 @@ def test_a_second_take_and_a_silent_camera_have_no_clock(estimates):
 
 
 def test_dates_days_apart_are_reported_and_do_not_decide(estimates):
-    contradictions = estimates.camera("head").contradictions
+    contradictions = estimates.camera("head").notes
     assert any("3.0 days apart" in text for text in contradictions)
-    assert not estimates.camera("left_palm").contradictions
+    assert not estimates.camera("left_palm").notes
 
 
 def test_a_stated_offset_is_compared(folder):
     right = estimate_clocks(capture(folder, "torso", "left_palm", left_palm=PALM_S)).camera("left_palm")
-    assert not right.contradictions
+    assert not right.notes
     turned = estimate_clocks(capture(folder, "torso", "left_palm", left_palm=-0.73)).camera("left_palm")
     assert turned.source == "sound"
-    assert "with the sign turned the sound agrees" in turned.contradictions[0]
+    assert "with the sign turned the sound agrees" in turned.notes[0]
     wrong = estimate_clocks(capture(folder, "torso", "left_palm", left_palm=0.2)).camera("left_palm")
-    assert "0.2000 s" in wrong.contradictions[0]
-    assert "sign" not in wrong.contradictions[0]
+    assert "0.2000 s" in wrong.notes[0]
+    assert "sign" not in wrong.notes[0]
 
 
 def test_a_stated_offset_is_kept_where_there_is_no_sound(folder):
@@ -157,7 +157,7 @@ def test_recordings_that_the_files_place_one_after_the_other_are_refused_with_th
             metadata={"creation_time": f"2024-05-01T10:0{minute}:00Z"},
         )
     clock = estimate_clocks(capture(tmp_path, "torso", "left_palm")).camera("left_palm")
-    assert (clock.source, clock.offset_s) == ("none", None)
+    assert clock.source == "none"
     # Both last 6 s and start 180 s apart.
     assert any("do not overlap: there are 174.0 s between them" in reason for reason in clock.reasons)
 

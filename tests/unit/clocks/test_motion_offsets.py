@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from bodycap_batch.clocks.joint_offsets import JointClock
 from bodycap_batch.clocks.motion_offsets import motion_clocks
 from bodycap_batch.clocks.motion_signals import CameraPath, motion_signals
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.model.geometry import interpolate_pose, make_transform, so3_exp
 
 RATE_HZ = 60.0
@@ -85,7 +85,7 @@ def make_body(seconds: float, seed: int = 0, *, kind: str = "free") -> Body:
     return Body(poses)
 
 
-def offset_of(first: CameraPath, second: CameraPath) -> JointClock:
+def offset_of(first: CameraPath, second: CameraPath) -> ClockRelation:
     """Return the clock of the second camera relative to the first one."""
     found = motion_clocks([first, second], first.camera)
     assert second.camera in found.clocks, found.reasons
@@ -151,7 +151,6 @@ def test_recordings_that_start_minutes_apart_and_drift() -> None:
     torso = body.path("torso", 0.0, 260.0, fps=20.0)
     palm = body.path("left_palm", 130.0, 269.0, fps=20.0, drift_ppm=80.0)
     found = offset_of(torso, palm)
-    assert found.drift_measured
     # At the middle of the palm's recording, where the drift hardly matters.
     assert abs(found.offset_s + 1e-6 * found.drift_ppm * 65.0 - 130.0 - 80e-6 * 65.0) < 0.05
     assert abs(found.drift_ppm - 80.0) < 3 * found.drift_sigma_ppm < 150.0

@@ -433,6 +433,6 @@ def test_a_warning_says_that_a_video_cannot_be_opened(tmp_path: Path) -> None:
     loaded = load_job_with_origins(root)
     for name, warning in zip(("GX010042.MP4", "GX010043.MP4"), sorted(loaded.warnings), strict=True):
         assert f"{name} cannot be opened: its end is missing" in warning
-    assert set(loaded.unreadable) == {root / "GX010042.MP4", root / "cam7" / "GX010043.MP4"}
+    assert set(loaded.beside.unreadable) == {root / "GX010042.MP4", root / "cam7" / "GX010043.MP4"}
     (root / "job.yaml").write_text(ONLY)
     assert load_job_with_origins(root).warnings == ()
