@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -105,51 +105,19 @@ def observed_joints(
     A bone without a camera is measured if at least one bone below it and at least one other bone outside its
     subtree are measured.
     """
-    measured: dict[int, BoolArray] = {}
+    measured = np.zeros((len(bones), len(tick_times_ns)), dtype=np.bool_)
+    half_step = np.median(np.diff(tick_times_ns)) / 2 if len(tick_times_ns) > 1 else 0
     for track in tracks:
         _, valid = track.poses_at(tick_times_ns, max_gap_ns=round(max_gap_s * 1e9))
-        half_step = np.median(np.diff(tick_times_ns)) / 2 if len(tick_times_ns) > 1 else 0
         near = np.abs(_nearest_times(track.times_ns, tick_times_ns) - tick_times_ns) <= half_step
-        own = measured.get(track.bone, np.zeros(len(tick_times_ns), dtype=bool))
-        measured[track.bone] = own | valid | near
-    below = {bone: mask.copy() for bone, mask in measured.items()}
-    never = np.zeros(len(tick_times_ns), dtype=bool)
+        measured[track.bone] |= valid | near
+    # Number of measured bones in the subtree of each bone, which contains the bone itself.
+    inside = measured.astype(np.int64)
     for index in range(len(bones) - 1, 0, -1):
-        parent = bones[index].parent
-        below[parent] = below.get(parent, never) | below.get(index, never)
-    out = np.zeros((len(tick_times_ns), len(skeleton.joints)), dtype=bool)
-    above: Mapping[int, BoolArray] = _measured_above(bones, measured, below, never)
-    for index, bone in enumerate(bones):
-        out[:, bone.joint] = measured.get(index, never) | (above[index] & below.get(index, never))
+        inside[bones[index].parent] += inside[index]
+    out = np.zeros((len(tick_times_ns), len(skeleton.joints)), dtype=np.bool_)
+    out[:, [bone.joint for bone in bones]] = (measured | ((inside > 0) & (inside < inside[0]))).T
     return out
-
-
-def _measured_above(
-    bones: Sequence[Bone],
-    measured: Mapping[int, BoolArray],
-    below: Mapping[int, BoolArray],
-    never: BoolArray,
-) -> dict[int, BoolArray]:
-    """Return, for each bone, the ticks (T,) at which at least one bone outside its subtree is measured.
-
-    The subtree of a bone consists of the bone and all bones below it.
-
-    Args:
-        bones: The graph's bones.
-        measured: By bone, (T,) whether the bone's own cameras measure it.
-        below: By bone, (T,) whether a bone in its subtree is measured.
-        never: (T,) mask that is False at all ticks.
-    """
-    above: dict[int, BoolArray] = {0: never}
-    for index, bone in enumerate(bones[1:], start=1):
-        siblings = [
-            other for other in range(1, len(bones)) if bones[other].parent == bone.parent and other != index
-        ]
-        mask = above[bone.parent] | measured.get(bone.parent, never)
-        for other in siblings:
-            mask = mask | below.get(other, never)
-        above[index] = mask
-    return above
 
 
 def _nearest_times(sorted_ns: IntArray, times_ns: IntArray) -> IntArray:
