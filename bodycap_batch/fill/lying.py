@@ -6,7 +6,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.fill.leg_geometry import LegGeometry
-from bodycap_batch.model.geometry import interpolate_pose, make_transform, so3_exp
+from bodycap_batch.model.geometry import interpolate_rotation, make_transform, so3_exp
 from bodycap_batch.model.skeleton import SkeletonModel
 
 _POINTED_RAD = (float(np.radians(25.0)), float(np.radians(75.0)))
@@ -34,7 +34,7 @@ def lay_legs(
     if len(ticks) == 0:
         return
     parents = skeleton.parents
-    joints = _joints_below(skeleton, leg.hip)
+    joints = skeleton.subtree(leg.hip)
     poses = world[ticks]
     local = {
         joint: np.swapaxes(poses[:, parents[joint], :3, :3], -1, -2) @ poses[:, joint, :3, :3]
@@ -47,7 +47,7 @@ def lay_legs(
         target = np.tile(np.eye(3), (len(ticks), 1, 1))
         if joint == leg.ankle:
             target = so3_exp(np.column_stack([pointed, zero, zero]))
-        local[joint] = _between(local[joint], target, share[ticks])
+        local[joint] = interpolate_rotation(local[joint], target, share[ticks])
     for _ in range(_CORRECTIONS):
         _write(skeleton, joints, local, poses)
         low = _lowest_m(skeleton, leg, poses) - floor_m
@@ -57,22 +57,6 @@ def lay_legs(
             poses, leg, parents, local[leg.hip], np.minimum(low - _ROOM_M, 0.0) * (low < 0.0)
         )
     world[ticks] = poses
-
-
-def _joints_below(skeleton: SkeletonModel, top: int) -> list[int]:
-    """Return a joint and all joints below it, parents first."""
-    out = [top]
-    for joint in range(top + 1, len(skeleton.joints)):
-        if int(skeleton.parents[joint]) in out:
-            out.append(joint)
-    return out
-
-
-def _between(first: FloatArray, second: FloatArray, share: FloatArray) -> FloatArray:
-    zero = np.zeros(3)
-    return np.asarray(
-        interpolate_pose(make_transform(first, zero), make_transform(second, zero), share)[:, :3, :3]
-    )
 
 
 def _write(

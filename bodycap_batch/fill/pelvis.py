@@ -6,12 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.fill.contacts import STAND, Contacts
 from bodycap_batch.fill.trunk_signals import TrunkSignals, low_pass
 from bodycap_batch.model.fill_data import Footsteps
-from bodycap_batch.model.geometry import interpolate_pose, make_transform, so3_exp
-from bodycap_batch.model.skeleton import SkeletonModel
+from bodycap_batch.model.geometry import interpolate_rotation, so3_exp
 
 _YAW_RAD = np.radians(3.0)
 """Amplitude of the pelvis's yaw with each stride, at 1.3 m/s. Source: M. P. Murray, A. B. Drought, R. C.
@@ -98,13 +97,8 @@ def following_pelvis(pelvis: FloatArray, trunk: FloatArray, reclined: FloatArray
         trunk: (T,3,3) orientation of the trunk in the world.
         reclined: (T,) 1 for a lying person.
     """
-    zero = np.zeros(3)
-    share = _smooth_step(_tilt_rad(trunk), _FOLLOWING_RAD) * (
-        _BOWING_SHARE + (1.0 - _BOWING_SHARE) * reclined
-    )
-    return np.asarray(
-        interpolate_pose(make_transform(pelvis, zero), make_transform(trunk, zero), share)[:, :3, :3]
-    )
+    most = _BOWING_SHARE + (1.0 - _BOWING_SHARE) * reclined
+    return interpolate_rotation(pelvis, trunk, _smooth_step(_tilt_rad(trunk), _FOLLOWING_RAD) * most)
 
 
 def _tilt_rad(rotation: FloatArray) -> FloatArray:
@@ -179,32 +173,3 @@ def reaching_pelvis(
         turn = turn - _AXIS_WEIGHTS * np.einsum("tij,ti->tj", slopes, solved)
         turn = _MAX_TURN_RAD * np.tanh(turn / _MAX_TURN_RAD)
     return np.asarray(pelvis @ so3_exp(low_pass(turn, _TURN_HZ, fps)))
-
-
-def bend_spine(
-    skeleton: SkeletonModel, first: int, pelvis: FloatArray, world: FloatArray, filled: BoolArray
-) -> None:
-    """Write the poses of the joints above the first measured joint: root, lower spine and their helpers.
-
-    Args:
-        skeleton: The skeleton.
-        first: Index of the first measured joint.
-        pelvis: (T,3,3) orientation of the pelvis.
-        world: (T,J,4,4) poses in the world; changed in place.
-        filled: (J,) which joints are filled; changed in place.
-    """
-    chain = [first]
-    while chain[-1] != 0:
-        chain.append(int(skeleton.parents[chain[-1]]))
-    last = len(chain) - 1
-    bending = [step for step in range(1, len(chain)) if skeleton.roles[chain[step]] or step == last]
-    trunk = make_transform(world[:, first, :3, :3], np.zeros(3))
-    target = make_transform(pelvis, np.zeros(3))
-    for step in range(1, len(chain)):
-        child, joint = chain[step - 1], chain[step]
-        fraction = np.full(len(world), (np.searchsorted(bending, step) + 1) / len(bending))
-        rotation = interpolate_pose(trunk, target, fraction)[:, :3, :3]
-        world[:, joint] = make_transform(
-            rotation, world[:, child, :3, 3] - rotation @ skeleton.offsets_m[child]
-        )
-        filled[joint] = True

@@ -172,7 +172,7 @@ def bone_vector(skeleton: SkeletonModel, role: str) -> FloatArray | None:
     if following is not None:
         vector = rest[following] - rest[joint]
         return np.asarray(vector) if np.linalg.norm(vector) > _MIN_BONE_M else None
-    subtree = [index for index in range(len(rest)) if joint in skeleton.path_to_root(index)]
+    subtree = skeleton.subtree(joint)
     tips = np.array([rest[i] + np.nan_to_num(skeleton.end_offsets_m[i]) - rest[joint] for i in subtree])
     farthest = tips[np.argmax(np.linalg.norm(tips, axis=1))]
     return np.asarray(farthest) if np.linalg.norm(farthest) > _MIN_BONE_M else None

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.merging.body.bones import Bone, joints_to_root
+from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.cameras.track import CameraTrack
-from bodycap_batch.model.geometry import interpolate_pose, make_transform
-from bodycap_batch.model.skeleton import SkeletonModel
+from bodycap_batch.model.geometry import make_transform
+from bodycap_batch.model.skeleton import SkeletonModel, bend_spine
 
 _MIN_LEVEL_AXIS = 0.3
 """Minimum horizontal length of the forward axis of a trunk that gives its heading. Unit: 1. Derivation: the
@@ -41,34 +41,16 @@ def complete_skeleton(
     for position, bone in enumerate(bones):
         out[:, bone.joint] = world_from_bone[:, position]
         solved[bone.joint] = True
+    first = bones[0].joint
+    trunk = out[:, first, :3, :3] @ bones[0].mean_rotation.T
+    bend_spine(skeleton, first, trunk, _yaw_only(trunk), out)
     posed = solved.copy()
-    _straighten_trunk_above(skeleton, bones[0], out, posed)
+    posed[skeleton.path_to_root(first)] = True
     for joint in range(count):
         if not posed[joint]:
             parent = out[:, skeleton.parents[joint]]
             out[:, joint] = parent @ make_transform(np.eye(3), skeleton.offsets_m[joint])
     return out, solved
-
-
-def _straighten_trunk_above(skeleton: SkeletonModel, first: Bone, out: FloatArray, posed: BoolArray) -> None:
-    """Write the poses of the joints above the first bone into `out` (T,J,4,4).
-
-    The function also sets these joints to True in `posed` (J,).
-    """
-    chain = joints_to_root(skeleton, first.joint)
-    trunk = out[:, first.joint].copy()
-    trunk[:, :3, :3] = trunk[:, :3, :3] @ first.mean_rotation.T
-    pelvis = make_transform(_yaw_only(trunk[:, :3, :3]), np.zeros(3))
-    # Joints without a role are helpers, and most of them have no length. They rotate with their parent.
-    last = len(chain) - 1
-    bending = [step for step in range(1, len(chain)) if skeleton.roles[chain[step]] or step == last]
-    for step in range(1, len(chain)):
-        child, joint = chain[step - 1], chain[step]
-        fraction = np.full(len(out), (np.searchsorted(bending, step) + 1) / len(bending))
-        rotation = interpolate_pose(trunk, pelvis, fraction)[:, :3, :3]
-        centre = out[:, child, :3, 3] - rotation @ skeleton.offsets_m[child]
-        out[:, joint] = make_transform(rotation, centre)
-        posed[joint] = True
 
 
 def _yaw_only(rotation: FloatArray) -> FloatArray:

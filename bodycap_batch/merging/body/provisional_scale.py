@@ -9,7 +9,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import EstimationError, ImplausibleBody
-from bodycap_batch.merging.body.bones import LIMB_CHAINS, Bone
+from bodycap_batch.merging.body.bones import LIMB_CHAINS, Bone, bones_to_root
 from bodycap_batch.merging.cameras.track import MAX_COARSE_GAP_NS, CameraTrack
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.skeleton import Mount
@@ -134,10 +134,8 @@ def kinematic_neighbours(
     by_bone = {track.bone: track for track in reversed(tracks)}
     root = next((track for track in tracks if track.bone == min(by_bone)), tracks[0])
     for track in tracks:
-        above = bones[track.bone].parent
-        while above >= 0 and above not in by_bone:
-            above = bones[above].parent
-        other = by_bone.get(above, root)
+        above = bones_to_root(bones, track.bone)[1:]
+        other = next((by_bone[bone] for bone in above if bone in by_bone), root)
         if other is not track:
             out.append((track, other))
     return out
@@ -172,7 +170,7 @@ def reach_constraint(bones: Sequence[Bone], bone: int, other: int) -> ReachConst
     Returns:
         The bound; None if a second limb lies between the bones. The distance then depends on both limbs.
     """
-    up, down = _bones_to_root(bones, other), _bones_to_root(bones, bone)
+    up, down = bones_to_root(bones, other), bones_to_root(bones, bone)
     shared = next(index for index in down if index in up)
     above = up[: up.index(shared)]
     if above and split_side(bones[other].role)[1] == "Arm":
@@ -188,11 +186,3 @@ def reach_constraint(bones: Sequence[Bone], bone: int, other: int) -> ReachConst
         else:
             anchor += bones[index].offset_m
     return ReachConstraint(anchor, reach)
-
-
-def _bones_to_root(bones: Sequence[Bone], bone: int) -> list[int]:
-    """Return the indices of the bone and its ancestors in the graph, the bone first."""
-    chain = [bone]
-    while bones[chain[-1]].parent >= 0:
-        chain.append(bones[chain[-1]].parent)
-    return chain

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.body.bones import Bone, anatomical_axes
+from bodycap_batch.merging.body.bones import Bone, anatomical_axes, bones_to_root
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import split_side
@@ -163,10 +163,8 @@ def trunk_orientation_from_prior(bones: Sequence[Bone], trunk: CameraTrack, moun
     The joints between the camera's bone and the first bone are assumed to be in the rest pose.
     """
     rest = np.eye(3)
-    index = trunk.bone
-    while bones[index].parent >= 0:
+    for index in bones_to_root(bones, trunk.bone)[:-1]:
         rest = bones[index].mean_rotation.T @ rest
-        index = bones[index].parent
     joint = trunk.map_from_cam[:, :3, :3] @ mount.joint_from_cam[:3, :3].T
     return TrunkOrientation(joint @ rest)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body.bones import LIMB_CHAINS, Bone
+from bodycap_batch.merging.body.bones import LIMB_CHAINS, Bone, bones_to_root
 from bodycap_batch.merging.body.provisional_scale import (
     distance_constraint,
     kinematic_neighbours,
@@ -260,8 +260,7 @@ def _smoothed_path(track: CameraTrack, at_ns: IntArray) -> FloatArray:
 
 def _rest_pose(bones: Sequence[Bone], mount: Mount, bone: int) -> FloatArray:
     """Return the pose (4,4) of a camera in the first bone's frame, with the body in the rest pose."""
-    pose, current = np.array(mount.joint_from_cam), bone
-    while bones[current].parent >= 0:
-        pose = make_transform(bones[current].mean_rotation, bones[current].offset_m) @ pose
-        current = bones[current].parent
+    pose = np.array(mount.joint_from_cam)
+    for index in bones_to_root(bones, bone)[:-1]:
+        pose = make_transform(bones[index].mean_rotation, bones[index].offset_m) @ pose
     return pose
