@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -116,19 +115,6 @@ class BodyCalibration:
     off_hinge_m: Mapping[str, float] = field(default_factory=dict)
 
 
-class ReferenceCameraRoll(NamedTuple):
-    """The roll of the reference camera, and the vertical.
-
-    Attributes:
-        roll_deg: Roll about the optical axis, degrees.
-        vertical: The vertical in the gauge of the tracks' map. None if neither the job nor the map nor the
-            walk determines the vertical, or if the reference camera is on a limb.
-    """
-
-    roll_deg: float
-    vertical: Vertical | None
-
-
 def calibrate_body(
     inputs: MergeInputs,
     options: MergeOptions,
@@ -222,14 +208,6 @@ def calibrate_body(
     )
 
 
-class _ResolvedRolls(NamedTuple):
-    """The result of the roll searches: inputs with rotated mount priors, posture hints, and the searches."""
-
-    inputs: MergeInputs
-    hints: PostureHints
-    searches: tuple[RollSearch, ...]
-
-
 def _resolve_camera_rolls(
     inputs: MergeInputs,
     bones: Sequence[Bone],
@@ -237,17 +215,20 @@ def _resolve_camera_rolls(
     t_pose_ns: tuple[int, int] | None,
     stated: Sequence[VerticalHypothesis],
     step: Callable[[], None],
-) -> _ResolvedRolls:
-    """Find the roll of the reference camera, then the rolls of the other cameras."""
+) -> tuple[MergeInputs, PostureHints, tuple[RollSearch, ...]]:
+    """Find the roll of the reference camera, then the rolls of the other cameras.
+
+    Returns:
+        The inputs with rotated mount priors, the facts about the posture, and the searches.
+    """
     roll_deg, found = reference_camera_roll(inputs, bones, data.tracks, data.provisional, stated)
     hints = PostureHints(vertical=None if found is None else found.up, t_pose_ns=t_pose_ns)
     inputs = with_rolls(inputs, {data.tracks[0].camera: roll_deg})
     searches = search_rolls(
         inputs.skeleton, inputs.mount_by_camera(), data.tracks, data.provisional, hints, step
     )
-    return _ResolvedRolls(
-        with_rolls(inputs, {search.camera: search.chosen_deg for search in searches}), hints, searches
-    )
+    inputs = with_rolls(inputs, {search.camera: search.chosen_deg for search in searches})
+    return inputs, hints, searches
 
 
 def reference_camera_roll(
@@ -256,7 +237,7 @@ def reference_camera_roll(
     tracks: Sequence[CameraTrack],
     provisional: float,
     stated: Sequence[VerticalHypothesis],
-) -> ReferenceCameraRoll:
+) -> tuple[float, Vertical | None]:
     """Find the roll of the reference camera, and the vertical if the job, the map or the walk gives it.
 
     Args:
@@ -267,7 +248,9 @@ def reference_camera_roll(
         stated: Possible verticals from the marker board that the job describes, and from accelerometers.
 
     Returns:
-        The roll and the vertical.
+        The roll about the optical axis, degrees, and the vertical in the gauge of the tracks' map. The
+        vertical is None if neither the job nor the map nor the walk determines it, or if the reference
+        camera is on a limb.
     """
     reference = tracks[0].scaled(provisional)
     points_m = provisional * map_points_of(inputs, reference.camera)
@@ -288,8 +271,8 @@ def reference_camera_roll(
             return None
         return trunk_orientation_from_prior(bones, reference, with_roll(prior, roll_deg)).upright_up()
 
-    roll_deg = reference_roll(inputs.mount_by_camera(), tracks, vertical_of, trunk_up_of).roll_deg
-    return ReferenceCameraRoll(roll_deg, found.get(roll_deg))
+    roll_deg = reference_roll(inputs.mount_by_camera(), tracks, vertical_of, trunk_up_of)
+    return roll_deg, found.get(roll_deg)
 
 
 def preliminary_vertical(

@@ -299,9 +299,7 @@ def _mount_report(prior: Mount, solved: Mount, calibration: BodyCalibration) -> 
         roll_deg=None if search is None else search.chosen_deg,
         roll_runner_up=None
         if runner_up is None
-        else RunnerUpRollReport(
-            roll_deg=runner_up.roll_deg, half_squared_sigmas_more=round(runner_up.extra_cost, 2)
-        ),
+        else RunnerUpRollReport(roll_deg=runner_up[0], half_squared_sigmas_more=round(runner_up[1], 2)),
         joint_from_cam=tuple(tuple(row) for row in solved.joint_from_cam.tolist()),
         sigma_deg=round(float(np.degrees(solved.sigma_rad)), 3),
         sigma_m=round(solved.sigma_m, 5),
