@@ -71,7 +71,6 @@ from bodycap_batch.merging.world.world_frame import initial_heading, rotation_to
 from bodycap_batch.model.camera_clock import ESTIMATED_SOURCES, CameraClock
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs, MergeResult, SolvedBody
-from bodycap_batch.model.merge_report import AlignedCameraReport
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.model.skeleton import Mount, MountSlip, SkeletonModel
 
@@ -259,7 +258,7 @@ def _solve_body(
                 still_ns=prepared.still_ns,
                 slips=slips,
                 unused=aligned.unused,
-                aligned={name: AlignedCameraReport(**sigmas) for name, sigmas in aligned.report().items()},
+                aligned=aligned.sigmas,
                 joint_sigma_m=sigma_percentiles(inputs.skeleton.roles, covariance, observed),
                 flexion_sigma_deg=flexion_percentiles(inputs.skeleton.roles, flexion_rad, observed),
                 joint_gap_m=joint_gaps(bones, solution.world_from_bone),
@@ -397,9 +396,7 @@ def _prepare_tracks(
     return _PreparedTracks(cleaned, scale, dropped, still_ns, slips)
 
 
-def _pose_sigmas(
-    aligned: Mapping[str, tuple[float, float]], slips: Mapping[str, MountSlip]
-) -> dict[str, PoseSigma]:
+def _pose_sigmas(aligned: Mapping[str, PoseSigma], slips: Mapping[str, MountSlip]) -> dict[str, PoseSigma]:
     """Return the uncertainty of the pose of a camera's map, or of a camera after a slip, by camera."""
     slipped = {camera: (slip.sigma_rad, slip.sigma_m) for camera, slip in slips.items()}
     none = (0.0, 0.0)

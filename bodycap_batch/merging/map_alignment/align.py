@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from bodycap_batch.merging.body_calibration.calibrate_body import (
     reference_camera_roll,
     with_rolls,
 )
+from bodycap_batch.merging.body_calibration.calibration_covariance import PoseSigma
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.cameras.track import CameraTrack, make_track, transform_track, transform_trajectory
@@ -36,7 +36,7 @@ from bodycap_batch.merging.map_alignment.scale_sources import (
     scale_from_walked_floor,
     stated_constraints,
 )
-from bodycap_batch.merging.map_alignment.similarity_refinement import AlignmentSigma, MapAlignmentProblem
+from bodycap_batch.merging.map_alignment.similarity_refinement import MapAlignmentProblem
 from bodycap_batch.merging.world.vertical import Vertical
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs
@@ -74,16 +74,14 @@ class AlignedMap:
         gauge: Gauge of the further map.
         cameras: Names of the further map's cameras.
         main_from_gauge: Similarity from the further map to the main map.
-        sigma_rad: Sigma of the map's rotation per axis, radians.
-        sigma_m: Sigma of the positions of the map's cameras per axis, metres.
+        sigma: Sigmas of the map's rotation, and of the positions of the map's cameras.
         reason: Reason why the map is not used; None if it is used.
     """
 
     gauge: str
     cameras: tuple[str, ...]
     main_from_gauge: Similarity
-    sigma_rad: float
-    sigma_m: float
+    sigma: PoseSigma
     reason: str | None
 
 
@@ -100,18 +98,8 @@ class UsableCameras:
 
     trajectories: tuple[Trajectory, ...]
     main_from_gauge: Mapping[str, Similarity]
-    sigmas: Mapping[str, AlignmentSigma]
+    sigmas: Mapping[str, PoseSigma]
     unused: Mapping[str, str]
-
-    def report(self) -> dict[str, Any]:
-        """Return the sigmas of each aligned camera as plain JSON values."""
-        return {
-            camera: {
-                "sigma_deg": round(float(np.degrees(sigma.rotation_rad)), 3),
-                "sigma_m": round(sigma.position_m, 5),
-            }
-            for camera, sigma in self.sigmas.items()
-        }
 
 
 def align_cameras(
@@ -157,11 +145,7 @@ def align_cameras(
         trajectories=(*main, *transformed),
         main_from_gauge={main[0].gauge: identity}
         | {gauge: item.main_from_gauge for gauge, item in aligned.items()},
-        sigmas={
-            camera: AlignmentSigma(item.sigma_rad, item.sigma_m)
-            for item in aligned.values()
-            for camera in item.cameras
-        },
+        sigmas={camera: item.sigma for item in aligned.values() for camera in item.cameras},
         unused=unused
         | {
             camera: _exclusion_reason(item.gauge, main[0].camera, main[0].gauge, item.reason)
@@ -349,8 +333,7 @@ def align_maps(
                 gauge=gauge,
                 cameras=cameras,
                 main_from_gauge=problem.corrections[index].after(initial[gauge]),
-                sigma_rad=sigma.rotation_rad,
-                sigma_m=sigma.position_m,
+                sigma=sigma,
                 reason=why,
             )
         )

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body_calibration.calibration_covariance import measurement_jacobian, scale_jacobian
+from bodycap_batch.merging.body_calibration.calibration_covariance import (
+    PoseSigma,
+    measurement_jacobian,
+    scale_jacobian,
+)
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.mount_covariance import LinearisedCalibration
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
@@ -24,18 +27,6 @@ _MAX_STEPS = 8
 _CONVERGED = 1e-3
 """Minimum relative change of the cost per step. A step with a smaller change is the last step. Evidence:
 none."""
-
-
-class AlignmentSigma(NamedTuple):
-    """The uncertainty of a map's alignment.
-
-    Attributes:
-        rotation_rad: Sigma of the map's rotation per axis, radians.
-        position_m: Sigma of the positions of the map's cameras per axis, metres.
-    """
-
-    rotation_rad: float
-    position_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +116,7 @@ class MapAlignmentProblem:
             if converged:
                 break
 
-    def sigmas(self, index: int) -> AlignmentSigma:
+    def sigmas(self, index: int) -> PoseSigma:
         """Return the sigmas of a map's rotation and of the sampled positions of this map's cameras.
 
         Args:
@@ -139,7 +130,7 @@ class MapAlignmentProblem:
         by_rotation = np.cross(modes[None, :3].swapaxes(1, 2), off.swapaxes(1, 2)).swapaxes(1, 2)
         shifts = by_rotation + off * modes[None, 3:4] + modes[None, 4:]
         position = (shifts**2).sum(axis=(1, 2)).mean()
-        return AlignmentSigma(float(np.sqrt((modes[:3] ** 2).sum() / 3.0)), float(np.sqrt(position / 3.0)))
+        return PoseSigma(float(np.sqrt((modes[:3] ** 2).sum() / 3.0)), float(np.sqrt(position / 3.0)))
 
     def _centres(self, index: int) -> tuple[FloatArray, FloatArray]:
         """Return the sampled centres (N,3) of a further map's cameras, metres, and their mean (3,)."""

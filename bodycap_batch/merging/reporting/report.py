@@ -9,6 +9,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.body_calibration.calibrate_body import BodyCalibration
+from bodycap_batch.merging.body_calibration.calibration_covariance import PoseSigma
 from bodycap_batch.merging.body_calibration.camera_roll import (
     hanging_tracks,
     has_unknown_roll,
@@ -102,7 +103,7 @@ class MotionFacts:
     still_ns: Mapping[str, tuple[int, int]]
     slips: Mapping[str, MountSlip]
     unused: Mapping[str, str]
-    aligned: Mapping[str, AlignedCameraReport]
+    aligned: Mapping[str, PoseSigma]
     joint_sigma_m: Mapping[str, Mapping[str, Mapping[str, float]]]
     flexion_sigma_deg: Mapping[str, Mapping[str, Mapping[str, float]]]
     joint_gap_m: Mapping[str, FloatArray]
@@ -153,7 +154,12 @@ def build_report(
             for camera, (first_ns, last_ns) in facts.still_ns.items()
         },
         unused_cameras=dict(facts.unused),
-        joined_cameras=dict(facts.aligned),
+        joined_cameras={
+            camera: AlignedCameraReport(
+                sigma_deg=round(float(np.degrees(sigma.rotation_rad)), 3), sigma_m=round(sigma.position_m, 5)
+            )
+            for camera, sigma in facts.aligned.items()
+        },
         joint_gap_m=_percentiles_by_name(facts.joint_gap_m),
         posture_sigmas={role: round(posture.rms, 4) for role, posture in facts.postures.items()},
         mean_posture_sigmas={role: round(posture.mean, 4) for role, posture in facts.postures.items()},
