@@ -52,7 +52,7 @@ class MeasurementResiduals:
     Attributes:
         distance_m: (N,) distances between the measured and the solved centres.
         angle_rad: (N,) angles between the measured and the solved orientations.
-        weights: (N,) robust weights of the measurements.
+        weights: (N,) robust weights of the measurements; 1 is the full weight.
     """
 
     distance_m: FloatArray
@@ -66,9 +66,7 @@ class MotionSolution:
 
     Attributes:
         world_from_bone: (T,B,4,4) pose of each bone at each tick.
-        residual_m: By camera, (N,) distance between each measured centre and the solved centre.
-        residual_rad: By camera, (N,) angle between each measured orientation and the solved orientation.
-        weights: By camera, (N,) robust weight of each measurement; 1 is the full weight.
+        residuals: By camera, the differences between its measured and its solved poses.
         world_from_cam: By camera, (N,4,4) solved pose at each measurement, from bone and mount.
         iterations: Number of iterations of the optimiser.
         errors: By kind of factor, half the sum of the squared residuals.
@@ -76,9 +74,7 @@ class MotionSolution:
     """
 
     world_from_bone: FloatArray
-    residual_m: Mapping[str, FloatArray]
-    residual_rad: Mapping[str, FloatArray]
-    weights: Mapping[str, FloatArray]
+    residuals: Mapping[str, MeasurementResiduals]
     world_from_cam: Mapping[str, FloatArray]
     iterations: int
     errors: Mapping[str, float]
@@ -282,9 +278,7 @@ class MotionGraph:
             first += size
         return MotionSolution(
             world_from_bone=poses,
-            residual_m={camera: each.distance_m for camera, each in residuals.items()},
-            residual_rad={camera: each.angle_rad for camera, each in residuals.items()},
-            weights={camera: each.weights for camera, each in residuals.items()},
+            residuals=residuals,
             world_from_cam=world_from_cam,
             iterations=count,
             errors=errors,

@@ -264,12 +264,9 @@ def _assemble(
     for part in parts:
         for kind, error in part.solution.errors.items():
             errors[kind] = errors.get(kind, 0.0) + error
-    residuals = {track.camera: measurement_residuals(track, cameras[track.camera]) for track in tracks}
     return MotionSolution(
         world_from_bone=poses,
-        residual_m={camera: each.distance_m for camera, each in residuals.items()},
-        residual_rad={camera: each.angle_rad for camera, each in residuals.items()},
-        weights={camera: each.weights for camera, each in residuals.items()},
+        residuals={track.camera: measurement_residuals(track, cameras[track.camera]) for track in tracks},
         world_from_cam=cameras,
         iterations=max(part.solution.iterations for part in parts),
         errors=errors,

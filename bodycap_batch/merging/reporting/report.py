@@ -182,12 +182,13 @@ def build_report(
 
 
 def _camera_report(track: CameraTrack, solution: MotionSolution, facts: MotionFacts) -> CameraReport:
+    residuals = solution.residuals[track.camera]
     return CameraReport(
         measurements=len(track.times_ns),
         dropped_as_gross_errors=len(facts.dropped[track.camera]),
-        down_weighted=int((solution.weights[track.camera] < _DOWN_WEIGHTED).sum()),
-        residual_m=_percentiles(solution.residual_m[track.camera]),
-        residual_deg=_percentiles(np.degrees(solution.residual_rad[track.camera])),
+        down_weighted=int((residuals.weights < _DOWN_WEIGHTED).sum()),
+        residual_m=_percentiles(residuals.distance_m),
+        residual_deg=_percentiles(np.degrees(residuals.angle_rad)),
         longest_gap_s=longest_gap_s(track, facts.start_ns, facts.end_ns),
     )
 
