@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.cameras.track import make_track
-from bodycap_batch.merging.graph.error_modes import ErrorModes, stack_modes
+from bodycap_batch.merging.graph.error_modes import ErrorModes, no_modes, stack_modes
 from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.merging.graph.joint_covariance import (
     flexion_percentiles,
@@ -30,9 +30,7 @@ def test_a_graph_without_factors_has_no_covariance(walk):
     values, _ = levenberg_marquardt(graph.graph, graph.initial_values(), iterations=1, step=lambda: None)
     loose = replace(graph.solved_graph(values), graph=gtsam.NonlinearFactorGraph())
     poses = np.tile(np.eye(4), (round(FPS), len(bones), 1, 1))
-    unchanged = np.zeros((len(bones), 3, 0))
-    modes = ErrorModes(mounts={}, log_scale=np.zeros(0), rest=unchanged, offsets_m=unchanged)
-    uncertainty = joint_covariance(loose, poses, modes)
+    uncertainty = joint_covariance(loose, poses, no_modes(bones, (), 0))
     assert uncertainty.centre_m2.shape == (*poses.shape[:2], 3, 3)
     assert np.isnan(uncertainty.centre_m2).all()
     assert uncertainty.flexion_rad2.shape == poses.shape[:2]
@@ -77,13 +75,7 @@ def _solve(graph, modes=None) -> MotionSolution:
 
 
 def _no_modes(bones) -> ErrorModes:
-    empty = np.zeros((len(bones), 3, 1))
-    return ErrorModes(
-        mounts={name: np.zeros((6, 1)) for name in ROLES},
-        log_scale=np.zeros(1),
-        rest=empty,
-        offsets_m=empty.copy(),
-    )
+    return no_modes(bones, ROLES, 1)
 
 
 def _centres(solution: MotionSolution) -> np.ndarray:
