@@ -14,7 +14,6 @@ from bodycap_batch.merging.body.t_pose import arm_span, find_t_pose
 from bodycap_batch.merging.body.trunk_lean import trunk_orientation, trunk_orientation_from_prior
 from bodycap_batch.merging.body_calibration.calibration_covariance import (
     PoseSigma,
-    ScaleUncertainty,
     error_modes,
     mounts_with_sigmas,
 )
@@ -36,9 +35,8 @@ from bodycap_batch.merging.body_calibration.scale import (
     scale_from_bones,
     scale_from_floor,
 )
-from bodycap_batch.merging.body_calibration.skeleton_error_modes import skeleton_error_modes
 from bodycap_batch.merging.cameras.track import CameraTrack
-from bodycap_batch.merging.graph.error_modes import ErrorModes
+from bodycap_batch.merging.graph.error_modes import ErrorModes, stack_modes
 from bodycap_batch.merging.graph.posture import is_mostly_walking
 from bodycap_batch.merging.world.floor import WALKING_HEIGHT_RATIO, floor_beside_path, standing_height
 from bodycap_batch.merging.world.measured_gravity import verticals_from_accelerometers
@@ -188,18 +186,19 @@ def calibrate_body(
     if scale.metres_per_unit != estimate.scale:
         graph.solve(scale.metres_per_unit)
     stature_m = MEAN_HEIGHT_M if inputs.height_m is None else inputs.height_m
-    modes = error_modes(
+    constant, transient = error_modes(
         graph,
-        ScaleUncertainty(scale.sigma_log, estimate.mount_slope),
+        scale.sigma_log,
+        estimate.mount_slope,
         data.alignment,
-        None if inputs.skeleton_is_measured else skeleton_error_modes(bones, samples.cameras, stature_m),
+        None if inputs.skeleton_is_measured else stature_m,
     )
     return BodyCalibration(
         scale=scale,
         bones_alone=estimate,
-        mounts=mounts_with_sigmas(graph, modes.constant),
+        mounts=mounts_with_sigmas(graph, constant),
         reference_prior=priors[tracks[0].camera],
-        error_modes=modes.stacked(),
+        error_modes=stack_modes([constant, transient]),
         vertical=up,
         height_over_floor_m=height_m,
         t_pose_ns=t_pose_ns,

@@ -7,7 +7,6 @@ systems place the joints at different points of the same body.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.graph.error_modes import ErrorModes, no_modes
@@ -36,38 +35,6 @@ Motion capture systems place a joint at different points of the body. The three 
 
 Derived from the skeletons of three makers, see docs/decisions/body_calibration.md.
 """
-
-
-@dataclass(frozen=True, slots=True)
-class SkeletonErrorModes:
-    """Error modes of a skeleton that was scaled from a stature. They increase the sigmas of the calibration.
-
-    Attributes:
-        bone_lengths: Error modes of the bone lengths. People of equal stature have different bone lengths.
-        joint_placement: Error modes of the joint positions. Motion capture systems place the joints
-            differently.
-    """
-
-    bone_lengths: ErrorModes
-    joint_placement: ErrorModes
-
-
-def skeleton_error_modes(
-    bones: Sequence[Bone], cameras: Sequence[str], stature_m: float
-) -> SkeletonErrorModes:
-    """Return the error modes of a skeleton that is scaled from a stature.
-
-    Args:
-        bones: Bones of the graph.
-        cameras: Names of the cameras. The modes do not change the mounts of these cameras.
-        stature_m: Stature of the subject, metres.
-
-    Returns:
-        The error modes of bone lengths and of joint placement.
-    """
-    return SkeletonErrorModes(
-        bone_length_modes(bones, cameras), joint_placement_modes(bones, cameras, stature_m)
-    )
 
 
 def bone_length_modes(bones: Sequence[Bone], cameras: Sequence[str]) -> ErrorModes:

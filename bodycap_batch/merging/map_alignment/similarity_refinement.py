@@ -107,8 +107,7 @@ class MapAlignmentProblem:
             trial = self._cost()
             converged = abs(trial - cost) < _CONVERGED * max(cost, 1.0)
             if trial > cost:
-                self._calibration.set_samples(before[0])
-                _, self._scale, self.corrections = before
+                self._calibration.samples, self._scale, self.corrections = before
                 self._calibration.solve(self._scale)
                 damping = max(100.0 * damping, 1e-2)
             else:
@@ -226,7 +225,7 @@ class MapAlignmentProblem:
             update = Similarity(factor, rotation, middle + shift / self._scale - factor * rotation @ middle)
             poses[members] = update.apply_to_poses(poses[members])
             self.corrections[index] = update.after(self.corrections[index])
-        self._calibration.set_samples(replace(samples, map_from_cam=poses))
+        self._calibration.samples = replace(samples, map_from_cam=poses)
         self._scale *= float(np.exp(change[0]))
 
 
