@@ -41,12 +41,7 @@ from bodycap_batch.merging.graph.foot_contact import (
     find_contacts,
     standing_joints,
 )
-from bodycap_batch.merging.graph.joint_covariance import (
-    flexion_percentiles,
-    flexion_sigma,
-    sigma_percentiles,
-    skeleton_covariance,
-)
+from bodycap_batch.merging.graph.joint_covariance import on_skeleton, sigma_percentiles
 from bodycap_batch.merging.graph.joint_distance_limits import soft_limits
 from bodycap_batch.merging.graph.motion_graph import (
     MotionGraph,
@@ -215,8 +210,11 @@ def _solve_body(
             for path in paths
         )
     observed = observed_joints(inputs.skeleton, bones, tracks, tick_times, options.max_gap_s)
-    covariance = skeleton_covariance(to_world.rotation, bones, solution.uncertainty, len(placed.solved))
-    flexion_rad = flexion_sigma(bones, solution.uncertainty, len(placed.solved))
+    assert solution.uncertainty is not None
+    turned_m2 = to_world.rotation @ solution.uncertainty.centre_m2 @ to_world.rotation.T
+    covariance = on_skeleton(bones, turned_m2, len(placed.solved))
+    sigma_m = np.sqrt(np.trace(covariance, axis1=2, axis2=3) / 3.0)
+    flexion_rad = on_skeleton(bones, np.sqrt(solution.uncertainty.flexion_rad2), len(placed.solved))
     body = SolvedBody(
         skeleton=inputs.skeleton,
         fps=fps,
@@ -259,8 +257,10 @@ def _solve_body(
                 slips=slips,
                 unused=aligned.unused,
                 aligned=aligned.sigmas,
-                joint_sigma_m=sigma_percentiles(inputs.skeleton.roles, covariance, observed),
-                flexion_sigma_deg=flexion_percentiles(inputs.skeleton.roles, flexion_rad, observed),
+                joint_sigma_m=sigma_percentiles(inputs.skeleton.roles, sigma_m, observed, digits=5),
+                flexion_sigma_deg=sigma_percentiles(
+                    inputs.skeleton.roles, np.degrees(flexion_rad), observed, digits=2
+                ),
                 joint_gap_m=joint_gaps(bones, solution.world_from_bone),
                 postures=posture_deviations(
                     bones, solution.world_from_bone[_outside_t_pose(tick_times, calibration.t_pose_ns)]

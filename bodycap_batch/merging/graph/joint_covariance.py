@@ -20,6 +20,7 @@ from bodycap_batch.merging.graph.factors import MotionState, bone_key
 from bodycap_batch.merging.graph.linearisation import LinearisedGraph, linearise
 from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
 from bodycap_batch.model.geometry import invert, se3_adjoint
+from bodycap_batch.model.merge_report import Percentiles
 
 _MODES_PER_SOLVE = 48
 """Number of error modes that are propagated at the same time. All modes of eleven cameras together would need
@@ -229,91 +230,38 @@ def _measurement_residual_jacobian(
     return out
 
 
-def flexion_sigma(
-    bones: Sequence[Bone], uncertainty: JointUncertainty | None, joints: int
-) -> FloatArray | None:
-    """Return the sigma (T,J), radians, of the flexion of each hinge of the skeleton.
+def on_skeleton(bones: Sequence[Bone], values: FloatArray, joints: int) -> FloatArray:
+    """Return values (T,B,...) of the graph's bones by joint of the skeleton (T,J,...); NaN for other joints.
 
     Args:
         bones: The graph's bones.
-        uncertainty: How well the joints of the bones are known; None if it was not computed.
+        values: (T,B,...) values of the bones.
         joints: Number J of joints of the skeleton.
-
-    Returns:
-        NaN for joints that are not hinges of the graph; None if `uncertainty` is None.
     """
-    if uncertainty is None:
-        return None
-    out = np.full((len(uncertainty.flexion_rad2), joints), np.nan)
-    out[:, [bone.joint for bone in bones]] = np.sqrt(uncertainty.flexion_rad2)
-    return out
-
-
-def skeleton_covariance(
-    rotation: FloatArray, bones: Sequence[Bone], uncertainty: JointUncertainty | None, joints: int
-) -> FloatArray | None:
-    """Return the covariance of all joints of the skeleton in rotated axes.
-
-    Args:
-        rotation: (3,3) rotation from the old axes to the new axes.
-        bones: The graph's bones.
-        uncertainty: How well the joints of the bones are known; None if it was not computed.
-        joints: Number J of joints of the skeleton.
-
-    Returns:
-        (T,J,3,3) covariances, NaN for joints without a bone in the graph; None if `uncertainty` is None.
-    """
-    if uncertainty is None:
-        return None
-    covariance = uncertainty.centre_m2
-    out = np.full((len(covariance), joints, 3, 3), np.nan)
-    out[:, [bone.joint for bone in bones]] = rotation @ covariance @ rotation.T
+    out = np.full((len(values), joints, *values.shape[2:]), np.nan)
+    out[:, [bone.joint for bone in bones]] = values
     return out
 
 
 def sigma_percentiles(
-    roles: Sequence[str], covariance: FloatArray | None, observed: BoolArray
-) -> dict[str, dict[str, dict[str, float]]]:
-    """Return percentiles of the sigmas of the joints' centres, separately for observed and filled ticks.
-
-    Args:
-        roles: Roles of the J joints.
-        covariance: (T,J,3,3) covariances of the joints' centres, NaN for joints that were not solved; None if
-            they were not computed.
-        observed: (T,J) whether cameras measured each joint at each tick. The other ticks are filled.
-
-    Returns:
-        By role of a joint, then by "observed" or "filled", then by "p50" or "p95": sigma (metres per axis).
-    """
-    if covariance is None:
-        return {}
-    return _percentiles(roles, np.sqrt(np.trace(covariance, axis1=2, axis2=3) / 3.0), observed, digits=5)
-
-
-def flexion_percentiles(
-    roles: Sequence[str], flexion_rad: FloatArray | None, observed: BoolArray
-) -> dict[str, dict[str, dict[str, float]]]:
-    """Return percentiles of the sigmas of the hinges' flexion, separately for observed and filled ticks.
-
-    Args:
-        roles: Roles of the J joints.
-        flexion_rad: (T,J) sigmas, radians, NaN for joints that are no hinges; None if they were not computed.
-        observed: (T,J) whether cameras measured each joint at each tick.
-
-    Returns:
-        By role of a joint, then by "observed" or "filled", then by "p50" or "p95": sigma, degrees.
-    """
-    return {} if flexion_rad is None else _percentiles(roles, np.degrees(flexion_rad), observed, digits=2)
-
-
-def _percentiles(
     roles: Sequence[str], sigma: FloatArray, observed: BoolArray, digits: int
-) -> dict[str, dict[str, dict[str, float]]]:
-    out: dict[str, dict[str, dict[str, float]]] = {}
+) -> dict[str, dict[str, Percentiles]]:
+    """Return percentiles of sigmas, separately for observed and filled ticks.
+
+    Args:
+        roles: Roles of the J joints.
+        sigma: (T,J) sigmas, NaN for joints without one.
+        observed: (T,J) whether cameras measured each joint at each tick. The other ticks are filled.
+        digits: Number of decimals.
+
+    Returns:
+        By role of a joint, then by "observed" or "filled", percentiles of the sigma.
+    """
+    out: dict[str, dict[str, Percentiles]] = {}
     for joint, role in enumerate(roles):
         for name, mask in (("observed", observed[:, joint]), ("filled", ~observed[:, joint])):
             found = sigma[mask & np.isfinite(sigma[:, joint]), joint]
             if role and len(found) and found.any():
-                figures = {f"p{q}": round(float(np.percentile(found, q)), digits) for q in (50, 95)}
-                out.setdefault(role, {})[name] = figures
+                p50, p95 = (round(float(np.percentile(found, q)), digits) for q in (50, 95))
+                out.setdefault(role, {})[name] = Percentiles(p50=p50, p95=p95)
     return out

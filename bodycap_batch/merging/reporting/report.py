@@ -104,8 +104,8 @@ class MotionFacts:
     slips: Mapping[str, MountSlip]
     unused: Mapping[str, str]
     aligned: Mapping[str, PoseSigma]
-    joint_sigma_m: Mapping[str, Mapping[str, Mapping[str, float]]]
-    flexion_sigma_deg: Mapping[str, Mapping[str, Mapping[str, float]]]
+    joint_sigma_m: Mapping[str, Mapping[str, Percentiles]]
+    flexion_sigma_deg: Mapping[str, Mapping[str, Percentiles]]
     joint_gap_m: Mapping[str, FloatArray]
     postures: Mapping[str, PostureDeviation]
     hinge_off_plane_m: Mapping[str, FloatArray]
@@ -163,8 +163,8 @@ def build_report(
         joint_gap_m=_percentiles_by_name(facts.joint_gap_m),
         posture_sigmas={role: round(posture.rms, 4) for role, posture in facts.postures.items()},
         mean_posture_sigmas={role: round(posture.mean, 4) for role, posture in facts.postures.items()},
-        joint_sigma_m=_sigmas_by_role(facts.joint_sigma_m),
-        flexion_sigma_deg=_sigmas_by_role(facts.flexion_sigma_deg),
+        joint_sigma_m=facts.joint_sigma_m,
+        flexion_sigma_deg=facts.flexion_sigma_deg,
         hinge_off_plane_m=_percentiles_by_name(facts.hinge_off_plane_m),
         loose_hinges={
             role: HingeReport(sigma_m=round(off_m, 5), known_to=describe_hinge(role, off_m))
@@ -350,15 +350,6 @@ def _activity_report(activity: Activity, violations_m: Mapping[str, FloatArray])
             if (violation > 0.0).any()
         },
     )
-
-
-def _sigmas_by_role(
-    sigmas: Mapping[str, Mapping[str, Mapping[str, float]]],
-) -> dict[str, dict[str, Percentiles]]:
-    return {
-        role: {name: Percentiles(**figures) for name, figures in each.items()}
-        for role, each in sigmas.items()
-    }
 
 
 def _percentiles_by_name(values: Mapping[str, FloatArray]) -> dict[str, Percentiles]:

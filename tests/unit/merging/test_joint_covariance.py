@@ -14,14 +14,14 @@ from bodycap_batch.merging.cameras.track import make_track
 from bodycap_batch.merging.graph.error_modes import ErrorModes, no_modes, stack_modes
 from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.merging.graph.joint_covariance import (
-    flexion_percentiles,
-    flexion_sigma,
     joint_covariance,
+    on_skeleton,
     sigma_percentiles,
 )
 from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution
 from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 from bodycap_batch.model.geometry import make_transform, se3_adjoint, so3_exp
+from bodycap_batch.model.merge_report import Percentiles
 from tests.stages.walker import FPS, ROLES, make_inputs, make_walk, record
 
 
@@ -175,15 +175,15 @@ def test_stacked_modes_contain_those_of_all_parts(walk):
 
 
 def test_sigmas_of_observed_and_filled_ticks_are_separate():
-    covariance = np.tile(np.eye(3) * 1e-4, (10, 3, 1, 1))
-    covariance[5:, 1] *= 4.0
-    covariance[:, 2] = np.nan
+    sigma = np.full((10, 3), 0.01)
+    sigma[5:, 1] *= 2.0
+    sigma[:, 2] = np.nan
     observed = np.ones((10, 3), dtype=bool)
     observed[5:, 1] = False
-    covariance[:, 0] = 0.0
-    found = sigma_percentiles(("Spine1", "LeftHand", "LeftFoot"), covariance, observed)
+    sigma[:, 0] = 0.0
+    found = sigma_percentiles(("Spine1", "LeftHand", "LeftFoot"), sigma, observed, digits=5)
     assert found == {
-        "LeftHand": {"observed": {"p50": 0.01, "p95": 0.01}, "filled": {"p50": 0.02, "p95": 0.02}}
+        "LeftHand": {"observed": Percentiles(p50=0.01, p95=0.01), "filled": Percentiles(p50=0.02, p95=0.02)}
     }
 
 
@@ -191,17 +191,16 @@ def test_the_sigma_of_a_hinge_is_that_of_the_bone_below_it(walk):
     graph, bones, _ = _graph(walk)
     solution = _solve(graph, _no_modes(bones))
     roles = [bone.role for bone in bones]
-    sigma = flexion_sigma(bones, solution.uncertainty, len(walk.skeleton.joints))
+    assert solution.uncertainty is not None
+    sigma = on_skeleton(bones, np.sqrt(solution.uncertainty.flexion_rad2), len(walk.skeleton.joints))
     known = {walk.skeleton.roles[joint] for joint in np.flatnonzero(np.isfinite(sigma).all(axis=0))}
     assert known == {"LeftForeArm", "RightForeArm"} & set(roles)
-    assert flexion_sigma(bones, None, 3) is None
     observed = np.ones(sigma.shape, dtype=bool)
-    found = flexion_percentiles(walk.skeleton.roles, sigma, observed)
+    found = sigma_percentiles(walk.skeleton.roles, np.degrees(sigma), observed, digits=2)
     joint = walk.skeleton.roles.index("LeftForeArm")
-    assert found["LeftForeArm"]["observed"]["p50"] == pytest.approx(
+    assert found["LeftForeArm"]["observed"].p50 == pytest.approx(
         np.degrees(np.median(sigma[:, joint])), abs=0.01
     )
-    assert flexion_percentiles(walk.skeleton.roles, None, observed) == {}
 
 
 def test_a_mounts_error_moves_the_joint_by_its_lever(walk):
