@@ -22,9 +22,8 @@ from bodycap_batch.merging.body_calibration.calibrate_body import (
 )
 from bodycap_batch.merging.body_calibration.calibration_covariance import PoseSigma
 from bodycap_batch.merging.camera_paths import trajectory_in_world, with_solved_centres
-from bodycap_batch.merging.camera_selection import select_cameras
 from bodycap_batch.merging.cameras.camera_axes import with_axes_of_cameras
-from bodycap_batch.merging.cameras.excluded_cameras import MIN_LOCALISED_FRAMES
+from bodycap_batch.merging.cameras.excluded_cameras import MIN_LOCALISED_FRAMES, excluded_cameras
 from bodycap_batch.merging.cameras.mount_slips import find_slip, without_slip
 from bodycap_batch.merging.cameras.still_parts import still_parts
 from bodycap_batch.merging.cameras.track import (
@@ -51,8 +50,10 @@ from bodycap_batch.merging.graph.motion_graph import (
     posture_deviations,
 )
 from bodycap_batch.merging.graph.windows import MAX_ITERATIONS, max_window_ticks, solve_windows
+from bodycap_batch.merging.main_map import align_usable_cameras
 from bodycap_batch.merging.projection.project import project_motion
 from bodycap_batch.merging.reporting.report import MotionFacts, build_report
+from bodycap_batch.merging.rig_priors import correlate_mount_priors
 from bodycap_batch.merging.unfit_camera import merge_without_unfit_camera
 from bodycap_batch.merging.world.floor import (
     WALKING_HEIGHT_RATIO,
@@ -147,7 +148,9 @@ def _solve_body(
         ImplausibleBody: The distances between the cameras fit no person.
         EstimationError: The data do not determine the motion.
     """
-    inputs, aligned = select_cameras(inputs, step, options, left_out)
+    excluded = {**excluded_cameras(inputs), **left_out}
+    inputs = correlate_mount_priors(inputs, excluded)
+    aligned = align_usable_cameras(inputs, step, options, excluded)
     used = aligned.trajectories
     bones = kinematic_chain(inputs.skeleton, {inputs.mount_of(each.camera).role for each in used})
     fps = options.fps or inputs.clocks[used[0].camera].nominal_fps

@@ -157,7 +157,7 @@ def test_the_alignment_gets_the_stated_vertical_and_the_roll_of_the_trunks_camer
     monkeypatch.setattr(align, "stated_constraints", lambda *_: StatedConstraints(verticals=(lying,)))
     monkeypatch.setattr(align, "reference_camera_roll", way_up)
     monkeypatch.setattr(align, "CalibrationGraph", calibration)
-    main, further = candidate_main_maps(short.inputs)[0]
+    main, further = candidate_main_maps(short.inputs, ())[0]
     assert "enough" in align_cameras(short.inputs, main, further[:1], lambda: None).unused[further[0].camera]
     assert received[0] == (lying,)
     usual = short.inputs.mount_of("torso").joint_from_cam
@@ -187,7 +187,7 @@ class _Strained(MapAlignmentProblem):
 
 def test_a_stated_scale_permits_an_alignment_with_inconsistent_scales(short, monkeypatch):
     monkeypatch.setattr(align, "MapAlignmentProblem", _Strained)
-    main, further = candidate_main_maps(short.inputs)[0]
+    main, further = candidate_main_maps(short.inputs, ())[0]
     refused, placed = (
         align_cameras(short.inputs, main, further[:1], lambda: None, options).unused
         for options in (MergeOptions(), _distance(short, "torso"))
@@ -211,7 +211,7 @@ def test_the_stated_scale_is_a_residual_of_the_problem():
 @pytest.mark.slow
 def test_a_known_scale_improves_the_alignment_of_palms():
     capture = _drawn(1000 / 30)
-    main, further = candidate_main_maps(capture.inputs)[0]
+    main, further = candidate_main_maps(capture.inputs, ())[0]
     off = []
     for options in (MergeOptions(), _distance(capture, "torso")):
         together = align_cameras(capture.inputs, main, further, lambda: None, options)
