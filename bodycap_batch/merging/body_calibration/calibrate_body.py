@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bodycap_batch.config.options import MarkerBoard, MergeOptions
+from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.body.t_pose import arm_span, find_t_pose
@@ -23,8 +23,6 @@ from bodycap_batch.merging.body_calibration.camera_roll import (
     search_rolls,
     with_roll,
 )
-from bodycap_batch.merging.body_calibration.known_distance import known_distance
-from bodycap_batch.merging.body_calibration.marker_board import LocatedBoard, locate_board
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import PostureHints, take_samples
 from bodycap_batch.merging.body_calibration.scale import (
@@ -35,11 +33,11 @@ from bodycap_batch.merging.body_calibration.scale import (
     scale_from_bones,
     scale_from_floor,
 )
+from bodycap_batch.merging.body_calibration.stated_constraints import stated_constraints
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.graph.error_modes import ErrorModes, stack_modes
 from bodycap_batch.merging.graph.posture import is_mostly_walking
 from bodycap_batch.merging.world.floor import WALKING_HEIGHT_RATIO, floor_beside_path, standing_height
-from bodycap_batch.merging.world.measured_gravity import verticals_from_accelerometers
 from bodycap_batch.merging.world.vertical import SceneContext, Vertical, VerticalHypothesis, estimate_vertical
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs
@@ -70,13 +68,12 @@ class CalibrationInput:
         alignment: Uncertainty of the pose of each camera's map in the main map. The key is the camera's
             name. It contains only cameras whose map was aligned to the main map.
         main_from_gauge: Similarity from each used map to the main map. The key is the gauge of the used map.
-            None if all cameras are in one map.
     """
 
     tracks: Sequence[CameraTrack]
     provisional: float
-    alignment: Mapping[str, PoseSigma] = field(default_factory=dict)
-    main_from_gauge: Mapping[str, Similarity] | None = None
+    alignment: Mapping[str, PoseSigma]
+    main_from_gauge: Mapping[str, Similarity]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,14 +138,8 @@ def calibrate_body(
     """
     tracks, provisional = data.tracks, data.provisional
     t_pose_ns = _t_pose_interval(inputs.skeleton, options.t_pose_s, bones, data)
-    board = locate_board(inputs.trajectories, inputs.board_views, options.marker_board, data.main_from_gauge)
-    main = next(each.gauge for each in inputs.trajectories if each.camera == tracks[0].camera)
-    gauges = data.main_from_gauge or {main: Similarity(1.0, np.eye(3), np.zeros(3))}
-    verticals = (
-        *stated_verticals(options.marker_board, board),
-        *verticals_from_accelerometers(inputs, gauges),
-    )
-    inputs, hints, rolls = _resolve_camera_rolls(inputs, bones, data, t_pose_ns, verticals, step)
+    stated = stated_constraints(inputs, options, data.main_from_gauge)
+    inputs, hints, rolls = _resolve_camera_rolls(inputs, bones, data, t_pose_ns, stated.verticals, step)
     priors = inputs.mount_by_camera()
     samples = take_samples(tracks, provisional, _SAMPLES, hints.vertical, t_pose_ns)
     graph = CalibrationGraph(inputs.skeleton, bones, samples, priors, provisional, step)
@@ -165,14 +156,12 @@ def calibrate_body(
         walks=not split_side(bones[0].role)[0] and is_mostly_walking(tracks[0].scaled(estimate.scale)),
     )
     up = estimate_vertical(
-        trunk_orientation(inputs.skeleton, bones, poses), scene, np.random.default_rng(0), verticals
+        trunk_orientation(inputs.skeleton, bones, poses), scene, np.random.default_rng(0), stated.verticals
     )
     walking = graph.samples.posture.walking
     # A person who bends or sits lowers the trunk. Only walking gives the trunk's height over the floor.
     upright = poses[walking] if walking.sum() >= MIN_WALKING_SAMPLES else poses
     height_m = _height_over_floor(bones[0], upright, up, scene)
-    distance = known_distance(inputs.trajectories, options.known_distance, data.main_from_gauge)
-    stated = (distance, None if board is None else board.scale)
     bones_alone = scale_from_bones(
         estimate,
         is_measured=inputs.skeleton_is_measured,
@@ -181,7 +170,7 @@ def calibrate_body(
     scale = combine_sources(
         bones_alone,
         None if height_m is None else scale_from_floor(bones_alone, height_m, scene.standing_m),
-        [source for source in stated if source is not None],
+        stated.scales,
     )
     if scale.metres_per_unit != estimate.scale:
         graph.solve(scale.metres_per_unit)
@@ -308,19 +297,6 @@ def preliminary_vertical(
         trunk_orientation_from_prior(bones, reference, mount), scene, np.random.default_rng(0), stated
     )
     return None if found.source == "body" or not found.is_determined() else found
-
-
-def stated_verticals(asked: MarkerBoard | None, board: LocatedBoard | None) -> tuple[VerticalHypothesis, ...]:
-    """Return the possible verticals that follow from the marker board of the job.
-
-    Args:
-        asked: The marker board that the job describes; None if the job describes none.
-        board: The marker board as located in the map; None if the job describes none.
-
-    Returns:
-        The possible verticals. Empty without a board, or if the job does not say how the board is placed.
-    """
-    return () if board is None or asked is None else board.verticals(asked.placed)
 
 
 def with_rolls(inputs: MergeInputs, rolls_deg: Mapping[str, float]) -> MergeInputs:

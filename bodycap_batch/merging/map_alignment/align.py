@@ -24,6 +24,10 @@ from bodycap_batch.merging.body_calibration.calibrate_body import (
 from bodycap_batch.merging.body_calibration.calibration_covariance import PoseSigma
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import take_samples
+from bodycap_batch.merging.body_calibration.stated_constraints import (
+    StatedConstraints,
+    stated_constraints,
+)
 from bodycap_batch.merging.cameras.track import CameraTrack, make_track, transform_track, transform_trajectory
 from bodycap_batch.merging.cameras.track_outliers import remove_outliers
 from bodycap_batch.merging.map_alignment.initial_alignment import (
@@ -31,12 +35,8 @@ from bodycap_batch.merging.map_alignment.initial_alignment import (
     align_maps_initially,
     require_common_time,
 )
-from bodycap_batch.merging.map_alignment.scale_sources import (
-    StatedConstraints,
-    scale_from_walked_floor,
-    stated_constraints,
-)
 from bodycap_batch.merging.map_alignment.similarity_refinement import MapAlignmentProblem
+from bodycap_batch.merging.map_alignment.walked_floor import scale_from_walked_floor
 from bodycap_batch.merging.world.vertical import Vertical
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs
@@ -292,7 +292,10 @@ def align_maps(
             different cameras were localised at the same time.
     """
     (main_gauge, main), *others = tracks.items()
-    stated = stated_constraints(inputs, options, main_gauge)
+    # A distance or a board in another map causes an error here. After all maps are aligned, the calibration
+    # uses both again and reports the remaining errors.
+    own_map = {main_gauge: Similarity(1.0, np.eye(3), np.zeros(3))}
+    stated = stated_constraints(inputs, options, own_map, skip_unusable=True)
     start = _initialise(inputs, bones, main, others, stated)
     inputs, alignment, up = start.inputs, start.alignment, start.up
     mounts = {mount.camera: mount for mount in inputs.mounts}

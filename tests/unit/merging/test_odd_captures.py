@@ -196,7 +196,7 @@ def test_a_known_distance_in_a_further_map_is_in_that_maps_units(body, recorded)
     )
     asked = ("right_palm:0", "right_palm:90", 2.0)
     half = Similarity(0.5, np.eye(3), np.zeros(3))
-    alone = known_distance(inputs.trajectories, asked)
+    alone = known_distance(inputs.trajectories, asked, {"map-1": Similarity(1.0, np.eye(3), np.zeros(3))})
     placed = known_distance(inputs.trajectories, asked, {"map-0": half, "map-1": half})
     assert placed.scale == pytest.approx(2.0 * alone.scale)
     with pytest.raises(EstimationError, match="not aligned with the main map"):
