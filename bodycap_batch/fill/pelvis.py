@@ -8,7 +8,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.fill.contacts import STAND, Contacts
-from bodycap_batch.fill.trunk_signals import TrunkSignals, low_pass
+from bodycap_batch.fill.trunk_signals import ORDINARY_SPEED_M_PER_S, TrunkSignals, low_pass
 from bodycap_batch.model.fill_data import Footsteps
 from bodycap_batch.model.geometry import interpolate_rotation, so3_exp
 
@@ -17,9 +17,8 @@ _YAW_RAD = np.radians(3.0)
 Kory, "Walking patterns of normal men", Journal of Bone and Joint Surgery 46-A, 1964: ± 3 to 5°. The smaller
 value, because the turn that reaches the feet is added."""
 _LIST_RAD = np.radians(3.5)
-"""Amplitude of the pelvis's list with each stride, at 1.3 m/s. Source: as `_YAW_RAD`."""
-_FULL_SPEED = 1.3
-"""Speed (m/s) for which these amplitudes hold. They are proportional to the speed."""
+"""Amplitude of the pelvis's list with each stride, at 1.3 m/s. Source: as `_YAW_RAD`. Both amplitudes are
+proportional to the speed."""
 _FOLLOWING_RAD = (float(np.radians(20.0)), float(np.radians(70.0)))
 """Angles of the trunk against the vertical from which the pelvis starts to follow it, and follows it most.
 Evidence: none."""
@@ -127,7 +126,9 @@ def pelvis_rotation(
     if has_gait:
         phase = stride_phase_rad(steps, ticks)
         walking = low_pass((contacts.state != STAND).astype(np.float64), _FADE_HZ, signals.fps)
-        strength = np.clip(walking, 0.0, 1.0) * np.clip(signals.speed_m_per_s() / _FULL_SPEED, 0.0, 1.3)
+        strength = np.clip(walking, 0.0, 1.0) * np.clip(
+            signals.speed_m_per_s() / ORDINARY_SPEED_M_PER_S, 0.0, 1.3
+        )
         yaw = yaw - _YAW_RAD * strength * np.cos(phase)
         tilt = -_LIST_RAD * strength * np.sin(phase)
     turn = so3_exp(np.column_stack([zero, zero, yaw]))

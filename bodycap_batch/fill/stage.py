@@ -239,14 +239,12 @@ def _fill_legs(
         if path is None:
             continue
         pose = pose_leg(leg, hip, path, world[:, 0, :3, :3])
-        for joint in leg.chain:
-            filled[joint] = True
         world[:, leg.hip, :3, :3] = pose.thigh
         _place_below(skeleton, leg.hip, leg.knee, world)
         world[:, leg.knee, :3, :3] = pose.shin
         _place_below(skeleton, leg.knee, leg.ankle, world)
         world[:, leg.ankle, :3, :3] = pose.foot
-        filled[[leg.hip, leg.knee, leg.ankle, *leg.below]] = True
+        filled[[*leg.chain, leg.knee, leg.ankle, *leg.below]] = True
         for joint in leg.below:
             _rotate_with_parent(skeleton, joint, world)
             if joint == leg.toe:

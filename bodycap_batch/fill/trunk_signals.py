@@ -18,6 +18,8 @@ steps, 2 Hz."""
 _STRIDE_HZ = 2.5
 """Cutoff frequency (Hz) of sway, yaw and arm swing, which repeat with each stride. Derivation: more than
 twice the frequency of ordinary strides, 1 Hz."""
+ORDINARY_SPEED_M_PER_S = 1.3
+"""Speed (m/s) of an ordinary walk, for which the sources state durations and angles."""
 _MIN_TICKS = 16
 """Minimum number of ticks of a filtered signal. Derivation: the padding of the filter."""
 
