@@ -9,11 +9,7 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.fill_data import SIDES
 from bodycap_batch.model.skeleton import SkeletonModel
-from bodycap_batch.model.skeleton_presets import rest_positions
-
-_ANKLE_OVER_LEG = 0.039 / 0.491
-"""Ratio of the ankle's height above the sole to the length of the leg. Source: R. Drillis, R. Contini, "Body
-segment parameters", 1966."""
+from bodycap_batch.model.skeleton_presets import ANKLE_OVER_LEG, rest_positions
 
 _FLAT_TOLERANCE_M = 0.02
 """Maximum difference (metres) between the drop from ankle to toe in the zero pose and the height of the ankle
@@ -164,7 +160,7 @@ def _one_leg(skeleton: SkeletonModel, side: str) -> LegGeometry | None:
         # A foot that ends at the ankle cannot touch the floor with its toes.
         tip = np.zeros(3)
     ball = tip if toe is None else rest[toe] - rest[ankle]
-    ankle_height = _ANKLE_OVER_LEG * length
+    ankle_height = ANKLE_OVER_LEG * length
     pitch = 0.0
     drop = float(-tip[2])
     if abs(drop - ankle_height) <= _FLAT_TOLERANCE_M:

@@ -21,7 +21,7 @@ changes the quantile."""
 _MAX_EXTENSION = 0.96
 """Distance between the ends of a stretched limb, divided by the limb's length. The ratio is below 1, because
 the elbows of a walking person keep 15 to 30° of flexion."""
-_MIN_COMMON_FRAMES = 10
+MIN_COMMON_FRAMES = 10
 """Minimum number of frames in which two cameras are localised at the same time. With fewer such frames, the
 distance between the two cameras is not used. Evidence: none."""
 
@@ -154,7 +154,7 @@ def distance_constraint(
     if constraint is None:
         return None
     poses, valid = other.poses_at(track.times_ns, max_gap_ns=MAX_COARSE_GAP_NS)
-    if valid.sum() < _MIN_COMMON_FRAMES:
+    if valid.sum() < MIN_COMMON_FRAMES:
         return None
     own_poses, other_poses = track.map_from_cam[valid], poses[valid]
     cam_from_joint = invert(mounts[track.camera].joint_from_cam)

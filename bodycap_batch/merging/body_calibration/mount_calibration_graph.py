@@ -27,6 +27,7 @@ from bodycap_batch.merging.body_calibration.samples import CalibrationSamples
 from bodycap_batch.merging.graph.attitude_factors import AttitudeFactors
 from bodycap_batch.merging.graph.error_modes import BodyModel
 from bodycap_batch.merging.graph.factors import (
+    POINTS_PER_MOUNT,
     JointFactors,
     add_mount_measurements,
     add_mount_prior,
@@ -42,12 +43,6 @@ from bodycap_batch.merging.graph.linearisation import linearise
 from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
-
-POINTS_PER_MOUNT = 4
-"""Number of points that represent a mount.
-
-Each measured camera pose and each mount prior adds one factor per point to the graph.
-"""
 
 
 class CalibrationGraph:

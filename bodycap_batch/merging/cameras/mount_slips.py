@@ -19,6 +19,7 @@ from scipy.special import logsumexp
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
 from bodycap_batch.merging.cameras.track import CameraTrack
+from bodycap_batch.merging.cameras.track_outliers import NEXT_FRAME
 from bodycap_batch.model.geometry import invert, make_transform, rotation_angle_rad, so3_exp, so3_log
 from bodycap_batch.model.skeleton import MountSlip
 
@@ -49,8 +50,6 @@ _USUAL_WINDOWS = 300
 _MIN_STEP = float(np.radians(5.0)), 0.015
 """Minimum step of a slip: radians, or metres. A smaller step is within the uncertainty of a mount."""
 
-_NEXT_FRAME = 1.5
-"""Maximum step between successive frames without a lost frame between them, in frame intervals."""
 _PIVOT_ITERATIONS = 10
 """Number of iterations of the robust fit of the pivot. Evidence: none."""
 _SMOOTH_S = 0.1
@@ -217,7 +216,7 @@ def _pivot_m(track: CameraTrack, frames: IntArray) -> FloatArray:
     easier to see.
     """
     poses, times = track.map_from_cam[frames], track.times_ns[frames]
-    even = np.diff(times) < _NEXT_FRAME * np.median(np.diff(times))
+    even = np.diff(times) < NEXT_FRAME * np.median(np.diff(times))
     even = even[1:] & even[:-1]
     turn, move = (np.diff(poses[:, :3, axes], n=2, axis=0)[even] for axes in (slice(3), 3))
     pivot, weight = np.zeros(3), np.ones(len(turn))

@@ -36,7 +36,7 @@ from bodycap_batch.merging.map_alignment.initial_alignment import (
     require_common_time,
 )
 from bodycap_batch.merging.map_alignment.similarity_refinement import MapAlignmentProblem
-from bodycap_batch.merging.map_alignment.walked_floor import scale_from_walked_floor
+from bodycap_batch.merging.map_alignment.walked_floor import MAX_SAMPLES, scale_from_walked_floor
 from bodycap_batch.merging.world.vertical import Vertical
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs
@@ -45,9 +45,6 @@ from bodycap_batch.model.scene import Trajectory
 MAX_SIGMA_M = 0.06
 """Maximum sigma (metres per axis) of the positions of a further map's cameras. A map with a larger sigma is
 not used. Evidence: none."""
-_MAX_SAMPLES = 240
-"""Maximum number of instants at which the cameras are sampled. It bounds the computing time. Evidence:
-none."""
 _REACH_SIGMA = 0.05
 """Sigma of the logarithm of the scale that follows from the limbs' reach. The sigma allows for the elbows of
 a walking person, which keep 15 to 30 degrees of flexion. The limbs' reach is used as a source of the scale,
@@ -305,7 +302,7 @@ def align_maps(
         *(transform_track(track, initial[gauge]) for gauge, group in others for track in group),
     ]
     together = _without_outliers(inputs, together, provisional)
-    samples = take_samples(together, provisional, _MAX_SAMPLES, None if up is None else up.up)
+    samples = take_samples(together, provisional, MAX_SAMPLES, None if up is None else up.up)
     calibration = CalibrationGraph(inputs.skeleton, bones, samples, mounts, provisional, step)
     names = {gauge: tuple(track.camera for track in group) for gauge, group in others}
     observable_sigma = _REACH_SIGMA if alignment.one_map_spans_a_limb else _SEPARATE_MAPS_SIGMA

@@ -11,6 +11,7 @@ from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import LIMB_CHAINS, Bone, bones_to_root
 from bodycap_batch.merging.body.provisional_scale import (
+    MIN_COMMON_FRAMES,
     distance_constraint,
     kinematic_neighbours,
     provisional_scale,
@@ -37,8 +38,6 @@ _MIN_COMMON_S = 4.0
 path does not determine the alignment."""
 _MIN_INSTANTS = 3
 """Minimum number of points of the shared path. Three points determine a rotation."""
-_MIN_COMMON_FRAMES = 10
-"""Minimum number of frames in which both cameras are localised at the same time. Evidence: none."""
 _MAX_SCALE_SIGMA = 0.25
 """Maximum sigma of the log of an observable scale. A scale with a larger sigma is treated as not observable.
 The sigma comes from the uncertainty of the mounts. Evidence: docs/decisions/merging.md."""
@@ -229,7 +228,7 @@ def require_common_time(main: CameraTrack, group: Sequence[CameraTrack]) -> None
         both_known = main_known & np.isfinite(_smoothed_path(track, at_ns)[:, 0])
         valid = track.poses_at(main.times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)[1]
         long = inside.any() and np.ptp(main.times_ns[inside]) * 1e-9 >= _MIN_COMMON_S
-        if long and both_known.sum() >= _MIN_INSTANTS and valid.sum() >= _MIN_COMMON_FRAMES:
+        if long and both_known.sum() >= _MIN_INSTANTS and valid.sum() >= MIN_COMMON_FRAMES:
             return
     raise EstimationError(
         f"the cameras {group[0].camera!r} and {main.camera!r} were localised at the same time for less "

@@ -14,8 +14,9 @@ from bodycap_batch.merging.world.vertical import Vertical
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.merge_data import MergeInputs
 
-_MAX_SAMPLES = 240
-"""Maximum number of instants at which the posture is evaluated. It bounds the computing time."""
+MAX_SAMPLES = 240
+"""Maximum number of instants at which cameras and posture are sampled. It bounds the computing time.
+Evidence: none."""
 
 
 def scale_from_walked_floor(
@@ -41,7 +42,7 @@ def scale_from_walked_floor(
     if up is None or joint is None:
         return None
     metric = track.scaled(body.scale)
-    times_ns = track.times_ns[evenly_spaced(len(track.times_ns), _MAX_SAMPLES)]
+    times_ns = track.times_ns[evenly_spaced(len(track.times_ns), MAX_SAMPLES)]
     walking = find_posture(metric, times_ns, up.up, None).walking
     if walking.sum() < MIN_WALKING_SAMPLES:
         return None

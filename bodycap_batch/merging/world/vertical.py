@@ -206,14 +206,9 @@ def estimate_vertical(
     ]
     leans = _LEAN_SAMPLES * body.negative_log_likelihood(np.array([each.up for each in hypotheses]))
     hypotheses = [
-        VerticalHypothesis(
-            source=each.source,
-            up=each.up,
-            sigma_deg=each.sigma_deg,
-            share=each.share,
-            negative_log_likelihood=each.negative_log_likelihood
-            + lean
-            + _scene_penalty(each.up, planes, scene),
+        replace(
+            each,
+            negative_log_likelihood=_cost(each) + lean + _scene_penalty(each.up, planes, scene),
         )
         for each, lean in zip(hypotheses, leans.tolist(), strict=True)
     ]
