@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -233,15 +233,7 @@ def _solve_body(
     projection = project_motion(body, inputs.clocks, inputs.row_fraction)
     step.finish()
     return MergeResult(
-        skeleton=body.skeleton,
-        fps=body.fps,
-        start_ns=body.start_ns,
-        graph_world_from_joint=body.graph_world_from_joint,
-        solved=body.solved,
-        observed=body.observed,
-        trajectories=body.trajectories,
-        mounts=body.mounts,
-        standing=body.standing,
+        **{item.name: getattr(body, item.name) for item in fields(body)},
         motion=projection.motion,
         projection_gap=projection.gap,
         world_from_map={gauge: world_from_map.after(main) for gauge, main in aligned.main_from_gauge.items()},
@@ -461,7 +453,8 @@ def _place_in_world(
     """
     up = calibration.vertical
     rotation = rotation_to_z_up(up.up)
-    joints, solved = complete_skeleton(skeleton, bones, _rotate_poses(rotation, solution.world_from_bone))
+    to_z_up = Similarity(1.0, rotation, np.zeros(3))
+    joints, solved = complete_skeleton(skeleton, bones, to_z_up.apply_to_poses(solution.world_from_bone))
     hips = joints[:, 0, :3, 3]
     standing = standing_height(skeleton, 0)
     path_m = solution.world_from_bone[:, 0, :3, 3]
@@ -477,7 +470,3 @@ def _place_in_world(
     )
     to_world = Similarity(1.0, world_from_solved.rotation @ rotation.T, world_from_solved.translation)
     return _PlacedBody(world_from_solved, to_world.apply_to_poses(joints), solved, floor)
-
-
-def _rotate_poses(rotation: FloatArray, poses: FloatArray) -> FloatArray:
-    return Similarity(1.0, rotation, np.zeros(3)).apply_to_poses(poses)

@@ -8,7 +8,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.merging.body.bones import Bone
-from bodycap_batch.merging.cameras.track import CameraTrack
+from bodycap_batch.merging.cameras.track import CameraTrack, nearest_times
 from bodycap_batch.model.geometry import make_transform
 from bodycap_batch.model.skeleton import SkeletonModel, bend_spine
 
@@ -91,7 +91,7 @@ def observed_joints(
     half_step = np.median(np.diff(tick_times_ns)) / 2 if len(tick_times_ns) > 1 else 0
     for track in tracks:
         _, valid = track.poses_at(tick_times_ns, max_gap_ns=round(max_gap_s * 1e9))
-        near = np.abs(_nearest_times(track.times_ns, tick_times_ns) - tick_times_ns) <= half_step
+        near = np.abs(nearest_times(track.times_ns, tick_times_ns) - tick_times_ns) <= half_step
         measured[track.bone] |= valid | near
     # Number of measured bones in the subtree of each bone, which contains the bone itself.
     inside = measured.astype(np.int64)
@@ -100,11 +100,3 @@ def observed_joints(
     out = np.zeros((len(tick_times_ns), len(skeleton.joints)), dtype=np.bool_)
     out[:, [bone.joint for bone in bones]] = (measured | ((inside > 0) & (inside < inside[0]))).T
     return out
-
-
-def _nearest_times(sorted_ns: IntArray, times_ns: IntArray) -> IntArray:
-    """Return the nearest of the sorted times (N,) for each of `times_ns` (T,)."""
-    after = np.clip(np.searchsorted(sorted_ns, times_ns), 0, len(sorted_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    closer = np.abs(sorted_ns[before] - times_ns) <= np.abs(sorted_ns[after] - times_ns)
-    return np.asarray(np.where(closer, sorted_ns[before], sorted_ns[after]))

@@ -27,19 +27,6 @@ distance between the two cameras is not used. Evidence: none."""
 
 
 @dataclass(frozen=True, slots=True)
-class ReachConstraint:
-    """Bound on the distance of a bone's joint from a point on another bone.
-
-    Attributes:
-        anchor_m: (3,) position of the point in the other bone's frame.
-        reach_m: Maximum distance (metres) of the joint from the point.
-    """
-
-    anchor_m: FloatArray
-    reach_m: float
-
-
-@dataclass(frozen=True, slots=True)
 class DistanceConstraint:
     """Bound on the distance between two points of the body, each measured by a camera.
 
@@ -153,6 +140,7 @@ def distance_constraint(
     constraint = reach_constraint(bones, track.bone, other.bone)
     if constraint is None:
         return None
+    anchor_m, reach_m = constraint
     poses, valid = other.poses_at(track.times_ns, max_gap_ns=MAX_COARSE_GAP_NS)
     if valid.sum() < MIN_COMMON_FRAMES:
         return None
@@ -160,15 +148,16 @@ def distance_constraint(
     cam_from_joint = invert(mounts[track.camera].joint_from_cam)
     cam_from_other = invert(mounts[other.camera].joint_from_cam)
     tip = own_poses[:, :3, :3] @ cam_from_joint[:3, 3]
-    base = other_poses[:, :3, :3] @ (cam_from_other[:3, :3] @ constraint.anchor_m + cam_from_other[:3, 3])
-    return DistanceConstraint(own_poses[:, :3, 3] - other_poses[:, :3, 3], tip - base, constraint.reach_m)
+    base = other_poses[:, :3, :3] @ (cam_from_other[:3, :3] @ anchor_m + cam_from_other[:3, 3])
+    return DistanceConstraint(own_poses[:, :3, 3] - other_poses[:, :3, 3], tip - base, reach_m)
 
 
-def reach_constraint(bones: Sequence[Bone], bone: int, other: int) -> ReachConstraint | None:
+def reach_constraint(bones: Sequence[Bone], bone: int, other: int) -> tuple[FloatArray, float] | None:
     """Return the bound on the distance of a bone's joint from a point on another bone.
 
     Returns:
-        The bound; None if a second limb lies between the bones. The distance then depends on both limbs.
+        The position (3,) of the point in the other bone's frame, and the maximum distance (metres). None if a
+        second limb lies between the bones. The distance then depends on both limbs.
     """
     up, down = bones_to_root(bones, other), bones_to_root(bones, bone)
     shared = next(index for index in down if index in up)
@@ -185,4 +174,4 @@ def reach_constraint(bones: Sequence[Bone], bone: int, other: int) -> ReachConst
             reach += float(np.linalg.norm(bones[index].offset_m))
         else:
             anchor += bones[index].offset_m
-    return ReachConstraint(anchor, reach)
+    return anchor, reach

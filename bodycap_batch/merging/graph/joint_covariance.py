@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -114,8 +114,7 @@ def joint_covariance(
     begin("joint covariances")
     linear = linearise(solved.graph, solved.values)
     begin("normal equations")
-    columns = _columns_by_tick(solved, linear)
-    order, bounds = columns.order, columns.bounds
+    order, bounds = _columns_by_tick(solved, linear)
     try:
         normal = BlockTridiagonal.from_sparse((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
     except np.linalg.LinAlgError:
@@ -182,19 +181,13 @@ def joint_covariance(
     return JointUncertainty(out, flexion)
 
 
-class _TickColumns(NamedTuple):
-    """The columns of the graph's Jacobian in the order of the ticks.
+def _columns_by_tick(solved: SolvedGraph, linear: LinearisedGraph) -> tuple[IntArray, IntArray]:
+    """Return the columns of the graph's Jacobian in the order of the ticks.
 
-    Attributes:
-        order: (C,) column indices, tick by tick. A state between two ticks belongs to the earlier tick.
-        bounds: (T+1,) start of each tick's columns in `order`, and C at the end.
+    Returns:
+        (C,) column indices, tick by tick. A state between two ticks belongs to the earlier tick. Then (T+1,)
+        the start of each tick's columns in them, and C at the end.
     """
-
-    order: IntArray
-    bounds: IntArray
-
-
-def _columns_by_tick(solved: SolvedGraph, linear: LinearisedGraph) -> _TickColumns:
     keys, ticks = [], []
     for chain in solved.chains:
         times = np.array([state.time_ns for state in chain])
@@ -206,7 +199,7 @@ def _columns_by_tick(solved: SolvedGraph, linear: LinearisedGraph) -> _TickColum
     start = np.array([linear.columns[key] for key in keys], dtype=np.int64)[by_tick]
     order = (start[:, None] + np.arange(6)).ravel()
     bounds = 6 * np.searchsorted(tick[by_tick], np.arange(len(solved.tick_times_ns) + 1))
-    return _TickColumns(np.asarray(order), np.asarray(bounds, dtype=np.int64))
+    return np.asarray(order), np.asarray(bounds, dtype=np.int64)
 
 
 def _measurement_residual_jacobian(

@@ -17,6 +17,7 @@ from bodycap_batch.merging.cameras.track import (
     MIN_SIGMA_M,
     MIN_SIGMA_RAD,
     CameraTrack,
+    nearest_times,
 )
 from bodycap_batch.merging.graph.error_modes import BodyModel, ErrorModes
 from bodycap_batch.merging.graph.factors import (
@@ -196,9 +197,11 @@ class MotionGraph:
             keys = []
             noises = _measurement_noises(track, self._mounts[track.camera])
             poses = track.map_from_cam @ invert(self._mounts[track.camera])
-            for time, pose, noise in zip(track.times_ns.tolist(), poses, noises, strict=True):
-                state_time = self._nearest_tick(time)
-                if abs(state_time - time) > ON_TICK_TOLERANCE_NS:
+            ticks = nearest_times(self._times, track.times_ns).tolist()
+            measurements = zip(track.times_ns.tolist(), ticks, poses, noises, strict=True)
+            for time, tick_time, pose, noise in measurements:
+                state_time = tick_time
+                if abs(tick_time - time) > ON_TICK_TOLERANCE_NS:
                     # Measurements of one bone within 1 ms share a state, because two states with almost
                     # equal times make the equations singular.
                     state_time = _merge_state_time(times_off_ticks[track.bone], time)
@@ -215,11 +218,6 @@ class MotionGraph:
             self._measured_keys[track.camera] = keys
         self._chains = [sorted(MotionState(time, *keys) for time, keys in chain.items()) for chain in nodes]
         self._factor_counts["measurements"] = int(self._graph.size())
-
-    def _nearest_tick(self, time_ns: int) -> int:
-        after = int(np.clip(np.searchsorted(self._times, time_ns), 1, max(len(self._times) - 1, 1)))
-        candidates = self._times[max(after - 1, 0) : after + 1].tolist()
-        return int(min(candidates, key=lambda tick: abs(tick - time_ns)))
 
     def _add_motion(self) -> None:
         before = self._graph.size()

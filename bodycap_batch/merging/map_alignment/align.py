@@ -212,30 +212,19 @@ def _exclusion_reason(gauge: str, trunk_camera: str, main_gauge: str, why: str) 
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Start:
-    """The initial values for the refinement of the alignment.
-
-    Attributes:
-        inputs: The inputs of the merge stage. The mount prior of the trunk's camera is rotated by the
-            estimated roll of this camera.
-        alignment: Initial similarities and scale.
-        up: The vertical in the main map; None if it is unknown.
-    """
-
-    inputs: MergeInputs
-    alignment: InitialAlignment
-    up: Vertical | None
-
-
 def _initialise(
     inputs: MergeInputs,
     bones: Sequence[Bone],
     main: Sequence[CameraTrack],
     others: Sequence[tuple[str, Sequence[CameraTrack]]],
     stated: StatedConstraints,
-) -> _Start:
-    """Estimate the roll of the trunk's camera and the initial alignment."""
+) -> tuple[MergeInputs, InitialAlignment, Vertical | None]:
+    """Estimate the roll of the trunk's camera and the initial alignment.
+
+    Returns:
+        The inputs with the mount prior of the trunk's camera rotated by this roll, the initial similarities
+        and scale, and the vertical in the main map; None if it is unknown.
+    """
     alignment = align_maps_initially(bones, main, others, {mount.camera: mount for mount in inputs.mounts})
     own = _without_outliers(inputs, main, alignment.metres_per_unit)
     roll, up = reference_camera_roll(inputs, bones, own, alignment.metres_per_unit, stated.verticals)
@@ -243,7 +232,7 @@ def _initialise(
         inputs = with_rolls(inputs, {main[0].camera: roll})
         mounts = {mount.camera: mount for mount in inputs.mounts}
         alignment = align_maps_initially(bones, main, others, mounts)
-    return _Start(inputs, alignment, up)
+    return inputs, alignment, up
 
 
 def _require_one_scale(strain: float, reach_sigma: float) -> None:
@@ -293,8 +282,7 @@ def align_maps(
     # uses both again and reports the remaining errors.
     own_map = {main_gauge: Similarity(1.0, np.eye(3), np.zeros(3))}
     stated = stated_constraints(inputs, options, own_map, skip_unusable=True)
-    start = _initialise(inputs, bones, main, others, stated)
-    inputs, alignment, up = start.inputs, start.alignment, start.up
+    inputs, alignment, up = _initialise(inputs, bones, main, others, stated)
     mounts = {mount.camera: mount for mount in inputs.mounts}
     initial, provisional = alignment.main_from_gauge, alignment.metres_per_unit
     together = [

@@ -88,8 +88,8 @@ def align_maps_initially(
         EstimationError: Nothing determines the scale, or the cameras' distances are impossible for a person.
     """
     groups = [main, *(group for _, group in others)]
-    information = _scale_information(bones, groups, mounts)
-    ignored = information.uninformative if np.isfinite(information.sigma_log) else ()
+    uninformative, sigma_log = _scale_information(bones, groups, mounts)
+    ignored = uninformative if np.isfinite(sigma_log) else ()
     metres_per_unit, similarities = np.inf, {}
     for _ in range(_ITERATIONS):
         similarities = {
@@ -100,7 +100,7 @@ def align_maps_initially(
     return InitialAlignment(
         main_from_gauge=similarities,
         metres_per_unit=metres_per_unit,
-        scale_observable=bool(information.sigma_log <= _MAX_SCALE_SIGMA),
+        scale_observable=bool(sigma_log <= _MAX_SCALE_SIGMA),
         one_map_spans_a_limb=_one_map_spans_a_limb(bones, groups),
     )
 
@@ -118,29 +118,19 @@ def _one_map_spans_a_limb(bones: Sequence[Bone], groups: Sequence[Sequence[Camer
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _ScaleInformation:
-    """Information about the scale from the distances between cameras.
-
-    Attributes:
-        uninformative: Names of cameras whose distance from a kinematic neighbour in another map contains no
-            information about the scale.
-        sigma_log: Sigma of the scale's logarithm from the distances of the other cameras; infinite without
-            such distances.
-    """
-
-    uninformative: set[str]
-    sigma_log: float
-
-
 def _scale_information(
     bones: Sequence[Bone], groups: Sequence[Sequence[CameraTrack]], mounts: Mapping[str, Mount]
-) -> _ScaleInformation:
+) -> tuple[set[str], float]:
     """Return how well the distances between cameras determine the scale.
 
     A distance between cameras in different maps contains information only if one camera is on a limb bone,
     and if this bone swings about a joint of the other camera's bone. The amount of information depends on the
     distance between the two cameras, and on the uncertainty of their mounts.
+
+    Returns:
+        Names of cameras whose distance from a kinematic neighbour in another map contains no information
+        about the scale. Then the sigma of the scale's logarithm from the distances of the other cameras;
+        infinite without such distances.
 
     Raises:
         EstimationError: No distance contains information, and a camera that hardly swings is in a separate
@@ -167,7 +157,7 @@ def _scale_information(
             hint="wear a camera on an upper arm, or let two cameras film the same places, so that both "
             "cameras are in one map",
         )
-    return _ScaleInformation(uninformative, 1.0 / np.sqrt(information) if information else np.inf)
+    return uninformative, 1.0 / float(np.sqrt(information)) if information else np.inf
 
 
 def align_map(

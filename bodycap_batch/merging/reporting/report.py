@@ -135,7 +135,7 @@ def build_report(
     main_tracks = [track for track in tracks if track.camera not in facts.aligned]
     return MergeReport(
         scale=_scale_report(calibration),
-        t_pose=_t_pose_report(calibration, facts.start_ns),
+        t_pose=None if calibration.t_pose_ns is None else _span_report(calibration.t_pose_ns, facts.start_ns),
         up=_vertical_report(inputs.mounts, calibration, main_tracks),
         floor=FloorReport(source=facts.floor.source, points=facts.floor.support),
         mounts={
@@ -147,11 +147,7 @@ def build_report(
         inverted_cameras=_inverted_cameras_report(inputs.mounts, calibration),
         slipped_mounts=_slips_report(calibration.mounts, facts),
         still_cameras={
-            camera: SpanReport(
-                from_s=round(1e-9 * (first_ns - facts.start_ns), 3),
-                to_s=round(1e-9 * (last_ns - facts.start_ns), 3),
-            )
-            for camera, (first_ns, last_ns) in facts.still_ns.items()
+            camera: _span_report(span_ns, facts.start_ns) for camera, span_ns in facts.still_ns.items()
         },
         unused_cameras=dict(facts.unused),
         joined_cameras={
@@ -284,10 +280,8 @@ def _vertical_report(
     )
 
 
-def _t_pose_report(calibration: BodyCalibration, start_ns: int) -> SpanReport | None:
-    if calibration.t_pose_ns is None:
-        return None
-    first, last = (round(1e-9 * (time - start_ns), 3) for time in calibration.t_pose_ns)
+def _span_report(span_ns: tuple[int, int], start_ns: int) -> SpanReport:
+    first, last = (round(1e-9 * (time - start_ns), 3) for time in span_ns)
     return SpanReport(from_s=first, to_s=last)
 
 

@@ -573,8 +573,9 @@ def test_the_reach_from_the_head_to_a_palm_starts_at_the_shoulder():
     assert found is not None
     rest = rest_positions(skeleton)
     shoulder = rest[skeleton.roles.index("LeftArm")] - rest[skeleton.roles.index("Head")]
-    assert_allclose(found.anchor_m, shoulder, atol=1e-12)
-    assert found.reach_m == pytest.approx((0.186 + 0.146) * 1.75)
+    anchor_m, reach_m = found
+    assert_allclose(anchor_m, shoulder, atol=1e-12)
+    assert reach_m == pytest.approx((0.186 + 0.146) * 1.75)
     palms = kinematic_chain(skeleton, ("LeftHand", "RightHand"))
     assert reach_constraint(palms, 4, len(palms) - 1) is None
 
