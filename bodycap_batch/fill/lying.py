@@ -6,8 +6,8 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.fill.leg_geometry import LegGeometry
-from bodycap_batch.model.geometry import interpolate_rotation, make_transform, so3_exp
-from bodycap_batch.model.skeleton import SkeletonModel
+from bodycap_batch.model.geometry import interpolate_rotation, so3_exp
+from bodycap_batch.model.skeleton import SkeletonModel, pose_joint
 
 _POINTED_RAD = (float(np.radians(25.0)), float(np.radians(75.0)))
 """Angles by which the toes of a person who lies on the back, and on the front, are lowered against the
@@ -49,7 +49,8 @@ def lay_legs(
             target = so3_exp(np.column_stack([pointed, zero, zero]))
         local[joint] = interpolate_rotation(local[joint], target, share[ticks])
     for _ in range(_CORRECTIONS):
-        _write(skeleton, joints, local, poses)
+        for joint in joints:
+            pose_joint(skeleton, joint, poses, local[joint])
         low = _lowest_m(skeleton, leg, poses) - floor_m
         if low.min() >= 0.0:
             break
@@ -57,14 +58,6 @@ def lay_legs(
             poses, leg, parents, local[leg.hip], np.minimum(low - _ROOM_M, 0.0) * (low < 0.0)
         )
     world[ticks] = poses
-
-
-def _write(
-    skeleton: SkeletonModel, joints: list[int], local: dict[int, FloatArray], poses: FloatArray
-) -> None:
-    for joint in joints:
-        own = make_transform(local[joint], skeleton.offsets_m[joint])
-        poses[:, joint] = poses[:, skeleton.parents[joint]] @ own
 
 
 def _lowest_m(skeleton: SkeletonModel, leg: LegGeometry, poses: FloatArray) -> FloatArray:

@@ -20,8 +20,7 @@ from bodycap_batch.fill.pelvis import following_pelvis, pelvis_rotation, reachin
 from bodycap_batch.fill.standing_height import HeightSigmas, StandingHeight, raised_pelvis, standing_height
 from bodycap_batch.fill.trunk_signals import TrunkSignals, trunk_signals
 from bodycap_batch.model.fill_data import SIDES, FillMode, FillReport, FillResult, Footsteps
-from bodycap_batch.model.geometry import make_transform
-from bodycap_batch.model.skeleton import Motion, SkeletonModel, bend_spine
+from bodycap_batch.model.skeleton import Motion, SkeletonModel, bend_spine, local_rotations, pose_joint
 from bodycap_batch.model.skeleton_presets import split_side
 
 _PROGRESS_STEPS = 4
@@ -97,7 +96,7 @@ def fill_motion(
     context.progress(3, _PROGRESS_STEPS, "head")
     _fill_head(skeleton, solved, (signals, reclined), world, filled)
     _follow_parents(skeleton, solved, filled, motion.local_rotation, world)
-    local = _local_rotations(skeleton, world)
+    local = local_rotations(skeleton, world[..., :3, :3])
     # A joint whose parent was not filled keeps its local rotation.
     kept = solved & ~filled[np.maximum(skeleton.parents, 0)]
     local[:, kept] = motion.local_rotation[:, kept]
@@ -200,7 +199,7 @@ def _within_reach(
         bend_spine(skeleton, first, world[:, first, :3, :3], rotation, poses)
         for leg in legs:
             for joint in leg.chain:
-                _rotate_with_parent(skeleton, joint, poses)
+                pose_joint(skeleton, joint, poses)
         return np.stack([poses[:, leg.hip, :3, 3] for leg in legs], axis=1)
 
     paths = [
@@ -230,7 +229,7 @@ def _fill_legs(
     missed = np.zeros((len(world), len(legs)), dtype=bool)
     for leg in legs:
         for joint in leg.chain:
-            _rotate_with_parent(skeleton, joint, world)
+            pose_joint(skeleton, joint, world)
     hips = np.stack([world[:, leg.hip, :3, 3] for leg in legs], axis=1)
     steps = reachable_steps(steps, legs, hips, signals.fps)
     for side, leg in enumerate(legs):
@@ -246,7 +245,7 @@ def _fill_legs(
         world[:, leg.ankle, :3, :3] = pose.foot
         filled[[*leg.chain, leg.knee, leg.ankle, *leg.below]] = True
         for joint in leg.below:
-            _rotate_with_parent(skeleton, joint, world)
+            pose_joint(skeleton, joint, world)
             if joint == leg.toe:
                 world[:, joint, :3, :3] = pose.toe
         missed[:, side] = np.linalg.norm(world[:, leg.ankle, :3, 3] - path.ankle_m, axis=1) > _MAX_MISS_M
@@ -271,22 +270,16 @@ def _fill_head(
     rotations = head_rotations(trunk[0], world[:, start, :3, :3], trunk[1])
     for joint, rotation in ((neck, rotations[0]), (head, rotations[1])):
         if joint is not None:
-            _rotate_with_parent(skeleton, joint, world)
+            pose_joint(skeleton, joint, world)
             world[:, joint, :3, :3] = rotation
             filled[joint] = True
-
-
-def _rotate_with_parent(skeleton: SkeletonModel, joint: int, world: FloatArray) -> None:
-    """Write the pose of a joint without rotation relative to its parent."""
-    parent = int(skeleton.parents[joint])
-    world[:, joint] = world[:, parent] @ make_transform(np.eye(3), skeleton.offsets_m[joint])
 
 
 def _place_below(skeleton: SkeletonModel, upper: int, lower: int, world: FloatArray) -> None:
     """Write the pose of each joint between two joints, the lower one included, without rotation."""
     path = skeleton.path_to_root(lower)
     for joint in reversed(path[: path.index(upper)]):
-        _rotate_with_parent(skeleton, joint, world)
+        pose_joint(skeleton, joint, world)
 
 
 def _follow_parents(
@@ -295,17 +288,7 @@ def _follow_parents(
     """Write the poses of all other joints: they keep their rotation relative to the parent."""
     for joint in range(1, len(solved)):
         if not solved[joint] and not filled[joint]:
-            parent = int(skeleton.parents[joint])
-            own = make_transform(local[:, joint], skeleton.offsets_m[joint])
-            world[:, joint] = world[:, parent] @ own
-
-
-def _local_rotations(skeleton: SkeletonModel, world: FloatArray) -> FloatArray:
-    rotation = world[..., :3, :3]
-    out = rotation.copy()
-    parents = skeleton.parents[1:]
-    out[:, 1:] = np.swapaxes(rotation[:, parents], -1, -2) @ rotation[:, 1:]
-    return out
+            pose_joint(skeleton, joint, world, local[:, joint])
 
 
 def _standing(steps: Footsteps, missed: BoolArray) -> BoolArray:

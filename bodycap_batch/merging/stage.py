@@ -68,7 +68,7 @@ from bodycap_batch.model.camera_clock import ESTIMATED_SOURCES, CameraClock
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs, MergeResult, SolvedBody
 from bodycap_batch.model.scene import Trajectory
-from bodycap_batch.model.skeleton import Mount, MountSlip, SkeletonModel
+from bodycap_batch.model.skeleton import MountSlip, SkeletonModel
 
 _EXPECTED_ITERATIONS = 80
 """Expected number of optimiser iterations in the whole stage. Evidence: none.
@@ -172,7 +172,10 @@ def _solve_body(
     step.what = "solving"
     scale = calibration.scale.metres_per_unit
     slips = {camera: slip.scaled(scale / prepared.provisional) for camera, slip in prepared.slips.items()}
-    solved_mounts = tuple(replace(mount, slip=slips.get(mount.camera)) for mount in calibration.mounts)
+    calibration = replace(
+        calibration,
+        mounts=tuple(replace(mount, slip=slips.get(mount.camera)) for mount in calibration.mounts),
+    )
     tracks = [within_ticks(track, tick_times) for track in tracks]
     metric = [track.scaled(scale) for track in tracks]
     rules = soft_limits(inputs.skeleton, bones, inputs.activity)
@@ -207,7 +210,7 @@ def _solve_body(
     paths = tuple(trajectory_in_world(each, world_from_map, prepared.dropped[each.camera]) for each in used)
     if options.camera_paths == "joint":
         own = {track.camera: track for track in metric}
-        by_camera = {mount.camera: mount for mount in solved_mounts}
+        by_camera = {mount.camera: mount for mount in calibration.mounts}
         paths = tuple(
             with_solved_centres(path, own[path.camera], by_camera[path.camera], solution, to_world)
             for path in paths
@@ -226,7 +229,7 @@ def _solve_body(
         solved=placed.solved,
         observed=observed,
         trajectories=paths,
-        mounts=solved_mounts,
+        mounts=calibration.mounts,
         standing=standing_joints(contacts, len(tick_times), len(placed.solved)),
     )
     step("projecting")
@@ -249,7 +252,6 @@ def _solve_body(
                 dropped=prepared.dropped,
                 floor=placed.floor,
                 still_ns=prepared.still_ns,
-                slips=slips,
                 unused=aligned.unused,
                 aligned=aligned.sigmas,
                 joint_sigma_m=sigma_percentiles(inputs.skeleton.roles, sigma_m, observed, digits=5),
@@ -369,11 +371,13 @@ def _prepare_tracks(
     mounts = inputs.mount_by_camera()
     tracks = [make_track(inputs, each, index[mounts[each.camera].role]) for each in used]
     provisional = provisional_scale(bones, tracks, mounts)
-    still_ns = {}
-    for position, still in _usable_still_parts(tracks, mounts, provisional).items():
-        times_ns = tracks[position].times_ns[still]
-        still_ns[tracks[position].camera] = int(times_ns[0]), int(times_ns[-1])
-        tracks[position] = tracks[position].keep(~still)
+    still_ns, found = {}, still_parts(tracks, mounts, provisional)
+    for position, track in enumerate(tracks):
+        still = found.get(track.camera)
+        if still is not None and int((~still).sum()) >= MIN_LOCALISED_FRAMES:
+            times_ns = track.times_ns[still]
+            still_ns[track.camera] = int(times_ns[0]), int(times_ns[-1])
+            tracks[position] = track.keep(~still)
     if still_ns:
         provisional = provisional_scale(bones, tracks, mounts)
     cleaned, dropped, slips = [], {}, {}
@@ -398,18 +402,6 @@ def _pose_sigmas(aligned: Mapping[str, PoseSigma], slips: Mapping[str, MountSlip
     return {
         camera: PoseSigma(*np.hypot(aligned.get(camera, none), slipped.get(camera, none)).tolist())
         for camera in sorted({*aligned, *slipped})
-    }
-
-
-def _usable_still_parts(
-    tracks: Sequence[CameraTrack], mounts: Mapping[str, Mount], scale: float
-) -> dict[int, BoolArray]:
-    """Return the still parts by position of the track, if enough frames remain without them."""
-    found = still_parts(tracks, mounts, scale)
-    return {
-        position: found[track.camera]
-        for position, track in enumerate(tracks)
-        if track.camera in found and int((~found[track.camera]).sum()) >= MIN_LOCALISED_FRAMES
     }
 
 

@@ -240,6 +240,32 @@ def forward_kinematics(
     return _chain_poses(skeleton, local)
 
 
+def local_rotations(skeleton: SkeletonModel, world_from_joint: FloatArray) -> FloatArray:
+    """Return the rotations parent_from_joint (T,J,3,3) for world_from_joint rotations (T,J,3,3).
+
+    The rotation of the root remains unchanged.
+    """
+    out = world_from_joint.copy()
+    parent = world_from_joint[:, skeleton.parents[1:]]
+    out[:, 1:] = np.swapaxes(parent, -1, -2) @ world_from_joint[:, 1:]
+    return out
+
+
+def pose_joint(
+    skeleton: SkeletonModel, joint: int, world: FloatArray, rotation: FloatArray | None = None
+) -> None:
+    """Write the pose of a joint that follows from that of its parent.
+
+    Args:
+        skeleton: The skeleton.
+        joint: Index of the joint; not the root.
+        world: (T,J,4,4) poses in the world, metres; changed in place.
+        rotation: (T,3,3) rotations parent_from_joint; None for a joint without rotation.
+    """
+    own = make_transform(np.eye(3) if rotation is None else rotation, skeleton.offsets_m[joint])
+    world[:, joint] = world[:, skeleton.parents[joint]] @ own
+
+
 def bend_spine(
     skeleton: SkeletonModel, joint: int, rotation: FloatArray, root: FloatArray, world: FloatArray
 ) -> None:

@@ -9,8 +9,7 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.cameras.track import CameraTrack, nearest_times
-from bodycap_batch.model.geometry import make_transform
-from bodycap_batch.model.skeleton import SkeletonModel, bend_spine
+from bodycap_batch.model.skeleton import SkeletonModel, bend_spine, pose_joint
 
 _MIN_LEVEL_AXIS = 0.3
 """Minimum horizontal length of the forward axis of a trunk that gives its heading. Unit: 1. Derivation: the
@@ -48,8 +47,7 @@ def complete_skeleton(
     posed[skeleton.path_to_root(first)] = True
     for joint in range(count):
         if not posed[joint]:
-            parent = out[:, skeleton.parents[joint]]
-            out[:, joint] = parent @ make_transform(np.eye(3), skeleton.offsets_m[joint])
+            pose_joint(skeleton, joint, out)
     return out, solved
 
 

@@ -235,21 +235,6 @@ def _initialise(
     return inputs, alignment, up
 
 
-def _require_one_scale(strain: float, reach_sigma: float) -> None:
-    """Raise an EstimationError if the scale from the limbs' reach and the solved scale contradict each other.
-
-    Args:
-        strain: Absolute difference of the two log scales, in sigmas.
-        reach_sigma: Sigma of the log scale from the limbs' reach.
-    """
-    if strain > _MAX_STRAIN:
-        raise EstimationError(
-            "the scale from the length of the limbs and the scale from the movement of the cameras differ "
-            f"by {100 * strain * reach_sigma:.0f} %",
-            hint="record a longer walk with turns",
-        )
-
-
 def _without_outliers(inputs: MergeInputs, tracks: Sequence[CameraTrack], scale: float) -> list[CameraTrack]:
     return [remove_outliers(each, scale, inputs.clocks[each.camera].nominal_fps) for each in tracks]
 
@@ -301,7 +286,13 @@ def align_maps(
     problem.solve()
     # A scale that the job gives may contradict the limbs' reach. Only other scales must agree with the reach.
     if not stated.scales:
-        _require_one_scale(abs(problem.scale_residual()), reach_sigma)
+        strain = abs(problem.scale_residual())
+        if strain > _MAX_STRAIN:
+            raise EstimationError(
+                "the scale from the length of the limbs and the scale from the movement of the cameras "
+                f"differ by {100 * strain * reach_sigma:.0f} %",
+                hint="record a longer walk with turns",
+            )
         points = map_points_of(inputs, together[0].camera)
         floor = scale_from_walked_floor(inputs, together[0], up, problem.scale(), points)
         problem.add_scale_sources(() if floor is None else (floor,))

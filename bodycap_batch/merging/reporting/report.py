@@ -80,7 +80,6 @@ class MotionFacts:
         floor: The floor.
         still_ns: By camera that stands still in the room for some time while the trunk moves, the first and
             the last common time of the frames that are not used therefore.
-        slips: By camera whose mount slips, the slip.
         unused: By name of an unused camera, the reason why the camera is not used.
         aligned: By camera, uncertainty of the pose of this camera's map in the main map. The mapping contains
             only cameras whose map was aligned to the main map.
@@ -101,7 +100,6 @@ class MotionFacts:
     dropped: Mapping[str, IntArray]
     floor: Floor
     still_ns: Mapping[str, tuple[int, int]]
-    slips: Mapping[str, MountSlip]
     unused: Mapping[str, str]
     aligned: Mapping[str, PoseSigma]
     joint_sigma_m: Mapping[str, Mapping[str, Percentiles]]
@@ -145,7 +143,7 @@ def build_report(
         cameras={track.camera: _camera_report(track, solution, facts) for track in tracks},
         exchanged_sides=_sides_report(inputs.mounts, calibration, main_tracks),
         inverted_cameras=_inverted_cameras_report(inputs.mounts, calibration),
-        slipped_mounts=_slips_report(calibration.mounts, facts),
+        slipped_mounts=_slips_report(calibration.mounts, facts.start_ns),
         still_cameras={
             camera: _span_report(span_ns, facts.start_ns) for camera, span_ns in facts.still_ns.items()
         },
@@ -313,11 +311,9 @@ def _mount_report(prior: Mount, solved: Mount, calibration: BodyCalibration) -> 
     )
 
 
-def _slips_report(mounts: Sequence[Mount], facts: MotionFacts) -> SlippedMountsReport | None:
+def _slips_report(mounts: Sequence[Mount], start_ns: int) -> SlippedMountsReport | None:
     slips = {
-        mount.camera: _slip_report(mount, facts.slips[mount.camera], facts.start_ns)
-        for mount in mounts
-        if mount.camera in facts.slips
+        mount.camera: _slip_report(mount, mount.slip, start_ns) for mount in mounts if mount.slip is not None
     }
     return SlippedMountsReport(cameras=slips, says=describe_slips(slips)) if slips else None
 
