@@ -36,6 +36,7 @@ from bodycap_batch.merging.graph.factors import (
     mount_from_points,
     mount_jacobian,
     mount_keys,
+    poses_from_values,
     values_from_poses,
 )
 from bodycap_batch.merging.graph.joint_priors import samples_per_gesture, widen_joint_priors
@@ -170,13 +171,7 @@ class CalibrationGraph:
 
     def poses(self) -> FloatArray:
         """Return the bone poses world_from_bone (K,B,4,4) of the last solution, metres."""
-        ticks = self.samples.valid.shape[1]
-        return np.array(
-            [
-                [self._values.atPose3(bone_key(tick, bone)).matrix() for bone in range(len(self.bones))]
-                for tick in range(ticks)
-            ]
-        )
+        return poses_from_values(self._values, self.samples.valid.shape[1], len(self.bones))
 
     def linearised(self) -> LinearisedCalibration:
         """Return the graph linearised at the last solution."""

@@ -254,3 +254,10 @@ def values_from_poses(poses: FloatArray) -> Any:
         for bone in range(poses.shape[1]):
             values.insert(bone_key(tick, bone), gtsam.Pose3(poses[tick, bone]))
     return values
+
+
+def poses_from_values(values: Any, ticks: int, bones: int) -> FloatArray:
+    """Return the poses (T,B,4,4) of the bones from GTSAM values."""
+    return np.array(
+        [[values.atPose3(bone_key(tick, bone)).matrix() for bone in range(bones)] for tick in range(ticks)]
+    )

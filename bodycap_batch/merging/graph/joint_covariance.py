@@ -5,8 +5,7 @@ Both contain the noise of the measurements and the errors of the calibration.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,10 +13,10 @@ from scipy import sparse
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.merging.body.bones import Bone
-from bodycap_batch.merging.cameras.track import CameraTrack
-from bodycap_batch.merging.graph.error_modes import BodyModel, ErrorModes, joint_residual_jacobian
-from bodycap_batch.merging.graph.factors import MotionState, bone_key
+from bodycap_batch.merging.graph.error_modes import ErrorModes, joint_residual_jacobian
+from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.merging.graph.linearisation import LinearisedGraph, linearise
+from bodycap_batch.merging.graph.motion_graph import JointUncertainty, MotionGraph
 from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
 from bodycap_batch.model.geometry import invert, se3_adjoint
 from bodycap_batch.model.merge_report import Percentiles
@@ -27,68 +26,8 @@ _MODES_PER_SOLVE = 48
 gigabytes."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SolvedGraph:
-    """A motion graph at its solution. The covariance of the joints is computed from it.
-
-    Attributes:
-        graph: Factors of the graph. The measurements come first, track by track.
-        values: Values of all variables at the solution.
-        body: Bones and hinges of the graph.
-        tick_times_ns: (T,) times of the timeline's ticks.
-        chains: States of each bone, in the order of time.
-        tracks: Measurements of each camera, poses in metres.
-        measured_keys: By camera, the key of the bone's pose at each measurement.
-        mounts: joint_from_cam (4,4) by camera. The solver held the mounts fixed.
-        first_joint: Index of the first joint factor in the graph.
-    """
-
-    graph: Any
-    values: Any
-    body: BodyModel
-    tick_times_ns: IntArray
-    chains: Sequence[Sequence[MotionState]]
-    tracks: Sequence[CameraTrack]
-    measured_keys: Mapping[str, Sequence[int]]
-    mounts: Mapping[str, FloatArray]
-    first_joint: int
-
-
-@dataclass(frozen=True, slots=True)
-class JointUncertainty:
-    """How well the joints of the bones are known.
-
-    Attributes:
-        centre_m2: (T,B,3,3) covariance, m², of each joint's centre relative to the first bone's joint centre,
-            in the axes of the solution.
-        flexion_rad2: (T,B) variance, rad², of the flexion of each hinge, at the bone below it. NaN for bones
-            whose joint is not a hinge.
-    """
-
-    centre_m2: FloatArray
-    flexion_rad2: FloatArray
-
-    def blended(self, later: JointUncertainty, low: int, weight: FloatArray) -> JointUncertainty:
-        """Return this uncertainty, continued by that of a later window.
-
-        Args:
-            later: The uncertainty from the tick `low` on.
-            low: First tick of the later window.
-            weight: (S,) weights of the later window at the ticks that both contain.
-        """
-
-        def join(one: FloatArray, other: FloatArray) -> FloatArray:
-            factor = weight.reshape(-1, *[1] * (one.ndim - 1))
-            both = (1.0 - factor) * one[low:] + factor * other[: len(weight)]
-            return np.concatenate([one[:low], both, other[len(weight) :]])
-
-        return JointUncertainty(
-            join(self.centre_m2, later.centre_m2), join(self.flexion_rad2, later.flexion_rad2)
-        )
-
-
 def joint_covariance(
-    solved: SolvedGraph,
+    graph: MotionGraph,
     world_from_bone: FloatArray,
     error_modes: ErrorModes,
     begin: Callable[[str], None] = lambda _: None,
@@ -102,7 +41,7 @@ def joint_covariance(
     computes J Σ Jᵀ by propagating each error mode to the joints.
 
     Args:
-        solved: The graph at its solution.
+        graph: The solved graph.
         world_from_bone: (T,B,4,4) solved poses of the bones.
         error_modes: Error modes of the calibration.
         begin: Called with the name of each part of the computation before the part starts. It may return
@@ -112,9 +51,9 @@ def joint_covariance(
         The uncertainty; NaN if the equations of the graph are singular.
     """
     begin("joint covariances")
-    linear = linearise(solved.graph, solved.values)
+    linear = linearise(graph.graph, graph.values)
     begin("normal equations")
-    order, bounds = _columns_by_tick(solved, linear)
+    order, bounds = _columns_by_tick(graph, linear)
     try:
         normal = BlockTridiagonal.from_sparse((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
     except np.linalg.LinAlgError:
@@ -122,15 +61,15 @@ def joint_covariance(
         nothing = np.full(world_from_bone.shape[:2], np.nan)
         return JointUncertainty(np.full((*nothing.shape, 3, 3), np.nan), nothing)
     begin("covariances of the measurements")
-    changes = _measurement_residual_jacobian(solved, linear, error_modes)
+    changes = _measurement_residual_jacobian(graph, linear, error_modes)
     changes = changes + joint_residual_jacobian(
-        linear, solved.body, solved.first_joint, world_from_bone, error_modes
+        linear, graph.body, graph.first_joint, world_from_bone, error_modes
     )
     changes = changes.tocsc()
     position = np.argsort(order)
     ticks, count = world_from_bone.shape[:2]
     out = np.zeros((ticks, count, 3, 3))
-    hinges = solved.body.hinges
+    hinges = graph.body.hinges
     flexion = np.full((ticks, count), np.nan)
     lowers = [hinge.lower for hinge in hinges]
     flexion[:, lowers] = 0.0
@@ -181,7 +120,7 @@ def joint_covariance(
     return JointUncertainty(out, flexion)
 
 
-def _columns_by_tick(solved: SolvedGraph, linear: LinearisedGraph) -> tuple[IntArray, IntArray]:
+def _columns_by_tick(graph: MotionGraph, linear: LinearisedGraph) -> tuple[IntArray, IntArray]:
     """Return the columns of the graph's Jacobian in the order of the ticks.
 
     Returns:
@@ -189,28 +128,28 @@ def _columns_by_tick(solved: SolvedGraph, linear: LinearisedGraph) -> tuple[IntA
         the start of each tick's columns in them, and C at the end.
     """
     keys, ticks = [], []
-    for chain in solved.chains:
+    for chain in graph.chains:
         times = np.array([state.time_ns for state in chain])
-        tick = np.clip(np.searchsorted(solved.tick_times_ns, times, side="right") - 1, 0, None)
+        tick = np.clip(np.searchsorted(graph.tick_times_ns, times, side="right") - 1, 0, None)
         keys += [key for state in chain for key in (state.pose_key, state.velocity_key)]
         ticks.append(np.repeat(tick, 2))
     tick = np.concatenate(ticks)
     by_tick = np.argsort(tick, kind="stable")
     start = np.array([linear.columns[key] for key in keys], dtype=np.int64)[by_tick]
     order = (start[:, None] + np.arange(6)).ravel()
-    bounds = 6 * np.searchsorted(tick[by_tick], np.arange(len(solved.tick_times_ns) + 1))
+    bounds = 6 * np.searchsorted(tick[by_tick], np.arange(len(graph.tick_times_ns) + 1))
     return np.asarray(order), np.asarray(bounds, dtype=np.int64)
 
 
 def _measurement_residual_jacobian(
-    solved: SolvedGraph, linear: LinearisedGraph, error_modes: ErrorModes
+    graph: MotionGraph, linear: LinearisedGraph, error_modes: ErrorModes
 ) -> Any:
     """Return the sparse change (R,M) of the measurements' residuals for each of the M error modes."""
     out = sparse.csr_matrix((linear.matrix.shape[0], len(error_modes.log_scale)))
-    middle = np.concatenate([track.map_from_cam[:, :3, 3] for track in solved.tracks]).mean(axis=0)
+    middle = np.concatenate([track.map_from_cam[:, :3, 3] for track in graph.tracks]).mean(axis=0)
     first = 0
-    for track in solved.tracks:
-        mount, keys = solved.mounts[track.camera], solved.measured_keys[track.camera]
+    for track in graph.tracks:
+        mount, keys = graph.mounts[track.camera], graph.measured_keys[track.camera]
         factors = first + np.arange(len(keys))
         by_mount = -(se3_adjoint(mount) @ error_modes.mounts[track.camera])
         change = np.repeat(by_mount[None], len(keys), axis=0)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack
 from bodycap_batch.merging.graph.error_modes import ErrorModes
+from bodycap_batch.merging.graph.joint_covariance import joint_covariance
 from bodycap_batch.merging.graph.motion_graph import (
     MotionGraph,
     MotionSolution,
-    SolverProgress,
     measurement_residuals,
 )
 from bodycap_batch.model.geometry import interpolate_pose
@@ -45,6 +47,17 @@ MAX_ITERATIONS = 20
 """Maximum number of iterations of the optimiser for one window. Evidence: none."""
 
 
+class SolverProgress(Protocol):
+    """Callback that reports the progress of the optimisation. It may raise to stop the optimisation."""
+
+    def __call__(self, what: str = "", /) -> None:
+        """Report the end of an iteration, or the start of a part of the computation.
+
+        Args:
+            what: Name of the part that starts; empty at the end of an iteration.
+        """
+
+
 def solve_windows(
     build: Callable[[IntArray, Sequence[CameraTrack]], MotionGraph],
     tick_times_ns: IntArray,
@@ -72,7 +85,13 @@ def solve_windows(
         low, high = with_overlap(tick_times_ns, first, last)
         clipped = [_clip_track(track, tick_times_ns, low, high) for track in tracks]
         measured = [track for track in clipped if len(track.times_ns)]
-        solution = build(tick_times_ns[low:high], measured).solve(MAX_ITERATIONS, step, error_modes)
+        graph = build(tick_times_ns[low:high], measured)
+        if error_modes is not None:
+            step("solving")
+        solution = graph.solve(MAX_ITERATIONS, step)
+        if error_modes is not None:
+            uncertainty = joint_covariance(graph, solution.world_from_bone, error_modes, step)
+            solution = replace(solution, uncertainty=uncertainty)
         parts.append((solution, first, low))
     return parts[0][0] if len(parts) == 1 else _blend_windows(parts, tick_times_ns, tracks)
 

@@ -9,8 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from bodycap_batch.merging.cameras.track import CameraTrack
-from bodycap_batch.merging.graph.joint_covariance import JointUncertainty
-from bodycap_batch.merging.graph.motion_graph import MotionSolution
+from bodycap_batch.merging.graph.motion_graph import JointUncertainty, MotionSolution
 from bodycap_batch.merging.graph.windows import (
     WINDOW_TICKS,
     max_window_ticks,
