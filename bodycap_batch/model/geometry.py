@@ -98,6 +98,11 @@ def so3_log(rotation: FloatArray) -> FloatArray:
     return np.asarray(vec.reshape(*rotation.shape[:-2], 3))
 
 
+def pose_vectors(pose: FloatArray) -> FloatArray:
+    """Return the rotation vectors (radians) and translations (N,6) of rigid transforms (N,4,4)."""
+    return np.hstack([so3_log(pose[:, :3, :3]), pose[:, :3, 3]])
+
+
 def so3_right_jacobian(rotvec_rad: FloatArray) -> FloatArray:
     """Return the right Jacobians (...,3,3) of rotation vectors (...,3), radians.
 

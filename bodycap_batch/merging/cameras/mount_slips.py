@@ -20,7 +20,14 @@ from scipy.special import logsumexp
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.merging.cameras.track_outliers import NEXT_FRAME
-from bodycap_batch.model.geometry import invert, make_transform, rotation_angle_rad, so3_exp, so3_log
+from bodycap_batch.model.geometry import (
+    invert,
+    make_transform,
+    pose_vectors,
+    rotation_angle_rad,
+    so3_exp,
+    so3_log,
+)
 from bodycap_batch.model.skeleton import MountSlip
 
 _FRAME_S = 1.0 / 30.0
@@ -432,7 +439,7 @@ def _is_along_path(track: CameraTrack, step: MountSlip, first_after: int, stride
         stride: Number of frames of the track for each frame that is compared.
     """
     index = first_after + stride * np.arange(-_HALF_FRAMES // 2, _HALF_FRAMES // 2)
-    moves = _twists(invert(track.map_from_cam[index[:-1]]) @ track.map_from_cam[index[1:]])
+    moves = pose_vectors(invert(track.map_from_cam[index[:-1]]) @ track.map_from_cam[index[1:]])
     moves = np.delete(moves, _HALF_FRAMES // 2 - 1, axis=0)
     velocity = np.median(moves, axis=0)
     spread = ((moves - velocity) ** 2).mean(axis=0).reshape(2, 3).mean(axis=1)
@@ -441,17 +448,12 @@ def _is_along_path(track: CameraTrack, step: MountSlip, first_after: int, stride
 
     def log_likelihood(means: FloatArray, variances: FloatArray) -> float:
         variances = np.repeat(variances + np.array([step.sigma_rad, step.sigma_m]) ** 2, 3, axis=1)
-        square = (_twists(step.before_from_after[None]) - means) ** 2 / variances
+        square = (pose_vectors(step.before_from_after[None]) - means) ** 2 / variances
         values = -0.5 * (square + np.log(variances)).sum(axis=1)
         return float(logsumexp(values) - np.log(len(values)))
 
     along = log_likelihood(intervals * velocity, intervals**2 * spread)
     return along > log_likelihood(np.zeros(6), kinds * np.array(_STEP_SIGMAS) ** 2)
-
-
-def _twists(poses: FloatArray) -> FloatArray:
-    """Return the rotation vectors and translations (N,6) of poses (N,4,4)."""
-    return np.hstack([so3_log(poses[:, :3, :3]), poses[:, :3, 3]])
 
 
 def _peaks(evidence: FloatArray) -> list[int]:

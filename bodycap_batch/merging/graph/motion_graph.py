@@ -34,7 +34,7 @@ from bodycap_batch.merging.graph.foot_contact import FootContact
 from bodycap_batch.merging.graph.joint_distance_limits import DistanceLimit
 from bodycap_batch.merging.graph.motion_prior import add_motion_prior
 from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
-from bodycap_batch.model.geometry import interpolate_pose, invert, so3_log
+from bodycap_batch.model.geometry import interpolate_pose, invert, pose_vectors, so3_log
 from bodycap_batch.model.skeleton import SkeletonModel
 
 ON_TICK_TOLERANCE_NS = 1_000_000
@@ -293,7 +293,7 @@ def measurement_residuals(track: CameraTrack, world_from_cam: FloatArray) -> Mea
     """
     measured_from_solved = invert(track.map_from_cam) @ world_from_cam
     half = np.linalg.cholesky(camera_covariance(track))
-    whitened = np.linalg.solve(half, _pose_error(measured_from_solved)[..., None])
+    whitened = np.linalg.solve(half, pose_vectors(measured_from_solved)[..., None])
     return MeasurementResiduals(
         distance_m=np.linalg.norm(measured_from_solved[:, :3, 3], axis=1),
         angle_rad=np.linalg.norm(so3_log(measured_from_solved[:, :3, :3]), axis=1),
@@ -334,11 +334,6 @@ def _measurement_noises(track: CameraTrack, joint_from_cam: FloatArray) -> list[
     return [gtsam.noiseModel.Gaussian.Covariance(each) for each in covariance]
 
 
-def _pose_error(pose: FloatArray) -> FloatArray:
-    """Return rotation vectors and translations (N,6) of poses (N,4,4) near the identity."""
-    return np.hstack([so3_log(pose[:, :3, :3]), pose[:, :3, 3]])
-
-
 def _geman_mcclure_weight(norm: FloatArray) -> FloatArray:
     """Return the robust weights of residuals with the given norms in sigmas."""
     squared = GEMAN_MCCLURE_C**2
@@ -365,7 +360,7 @@ def _initial_states(
     span = tick_s[first + 1] - tick_s[first]
     alpha = np.clip((state_s - tick_s[first]) / span, 0.0, 1.0)
     step = invert(poses[first]) @ poses[first + 1]
-    return interpolate_pose(poses[first], poses[first + 1], alpha), _pose_error(step) / span[:, None]
+    return interpolate_pose(poses[first], poses[first + 1], alpha), pose_vectors(step) / span[:, None]
 
 
 def joint_gaps(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, FloatArray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,19 +27,6 @@ _MAX_STEPS = 8
 _CONVERGED = 1e-3
 """Minimum relative change of the cost per step. A step with a smaller change is the last step. Evidence:
 none."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Step:
-    """A Gauss-Newton step for G further maps.
-
-    Attributes:
-        change: (1 + 7 G,) change of the log scale, and of each map's rotation, log scale and translation.
-        covariance: (1 + 7 G, 1 + 7 G) covariance of `change`.
-    """
-
-    change: FloatArray
-    covariance: FloatArray
 
 
 class MapAlignmentProblem:
@@ -82,7 +69,7 @@ class MapAlignmentProblem:
             self._descend()
         self._calibration.leave_out_map_errors()
         self._descend()
-        self._covariance = self._step(0.0).covariance
+        _, self._covariance = self._step(0.0)
 
     def scale(self) -> ScaleSource:
         """Return the solved scale of the main map."""
@@ -94,14 +81,14 @@ class MapAlignmentProblem:
         if sources:
             self._sources += tuple(sources)
             self._descend()
-            self._covariance = self._step(0.0).covariance
+            _, self._covariance = self._step(0.0)
 
     def _descend(self) -> None:
         """Take damped steps until the cost hardly changes."""
         cost = self._cost()
         damping = 1e-4
         for _ in range(_MAX_STEPS):
-            change = self._step(damping).change
+            change, _ = self._step(damping)
             before = self._calibration.samples, self._scale, list(self.corrections)
             self._apply(change)
             trial = self._cost()
@@ -137,11 +124,15 @@ class MapAlignmentProblem:
         centres = self._scale * samples.map_from_cam[members][samples.valid[members], :3, 3]
         return centres, centres.mean(axis=0)
 
-    def _step(self, damping: float) -> _Step:
+    def _step(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """Return the Gauss-Newton step that lowers the cost, with its covariance.
 
         Args:
             damping: Relative increase of the diagonal of the normal equations.
+
+        Returns:
+            For G further maps, (1 + 7 G,) change of the log scale, and of each map's rotation, log scale and
+            translation. Then (1 + 7 G, 1 + 7 G) the covariance of this change.
         """
         mounts, derivatives = self._linearised()
         solved = mounts.reduced(derivatives)
@@ -159,7 +150,7 @@ class MapAlignmentProblem:
         free = np.arange(len(normal) - count, len(normal))
         normal[free, free] *= 1.0 + damping
         change = _solve_normal_equations(normal, influence.T @ rhs)[-count:]
-        return _Step(np.asarray(change, dtype=np.float64), np.asarray(covariance[-count:, -count:]))
+        return np.asarray(change, dtype=np.float64), np.asarray(covariance[-count:, -count:])
 
     def _linearised(self) -> tuple[LinearisedCalibration, FloatArray]:
         """Linearise the calibration.
