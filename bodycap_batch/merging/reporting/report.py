@@ -264,7 +264,7 @@ def _vertical_report(
         source=up.source,
         sigma_deg=round(up.sigma_deg, 2),
         body_off_deg=None if up.body_off_deg is None else round(up.body_off_deg, 3),
-        plane_points_share=round(up.plane_share, 3),
+        plane_points_share=round(up.share, 3),
         others=tuple(
             OtherVerticalReport(
                 name=other.source,

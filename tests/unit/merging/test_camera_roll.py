@@ -77,7 +77,7 @@ def test_cameras_upside_down_are_named_with_the_measured_roll(upside_down, given
 
 
 def test_it_is_said_if_nothing_shows_which_way_up_a_camera_is_mounted():
-    vertical = Vertical(UP, "map", 3.0, 0.9, sigma_deg=1.0)
+    vertical = Vertical(up=UP, source="map", sigma_deg=1.0, body_off_deg=3.0, share=0.9)
     assert describe_vertical(vertical).endswith("(1 sigma)")
     text = describe_vertical(vertical, describe_unknown_way_up("torso"))
     assert "torso is assumed to be mounted upright" in text

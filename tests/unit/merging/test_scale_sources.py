@@ -42,7 +42,7 @@ def short():
 
 
 def _direction(up, source="map"):
-    return Vertical(up, source, None, 0.0)
+    return Vertical(up=up, source=source, sigma_deg=0.0, body_off_deg=None, share=0.0)
 
 
 def _asked(capture, options, points=None, off=1.1, up="map"):
