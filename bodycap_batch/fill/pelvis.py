@@ -8,7 +8,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.fill.contacts import STAND, Contacts
-from bodycap_batch.fill.trunk_signals import ORDINARY_SPEED_M_PER_S, TrunkSignals, low_pass
+from bodycap_batch.fill.trunk_signals import ORDINARY_SPEED_M_PER_S, STEP_HZ, TrunkSignals, low_pass
 from bodycap_batch.model.fill_data import Footsteps
 from bodycap_batch.model.geometry import interpolate_rotation, so3_exp
 
@@ -45,8 +45,6 @@ _DIFFERENCE_RAD = 1e-3
 """Angle (radians) of the numeric derivative of the hip joints. Derivation: it moves them by 0.1 mm."""
 _CORRECTIONS = 3
 """Number of linear corrections. Evidence: none."""
-_TURN_HZ = 4.0
-"""Cutoff frequency (Hz) of this turn. Derivation: twice the frequency of ordinary steps."""
 _FADE_HZ = 1.5
 """Cutoff frequency (Hz) of the start and the end of these rotations. Evidence: none."""
 
@@ -173,4 +171,4 @@ def reaching_pelvis(
         solved = np.linalg.solve(damped, excess[:, :, None])[:, :, 0]
         turn = turn - _AXIS_WEIGHTS * np.einsum("tij,ti->tj", slopes, solved)
         turn = _MAX_TURN_RAD * np.tanh(turn / _MAX_TURN_RAD)
-    return np.asarray(pelvis @ so3_exp(low_pass(turn, _TURN_HZ, fps)))
+    return np.asarray(pelvis @ so3_exp(low_pass(turn, STEP_HZ, fps)))

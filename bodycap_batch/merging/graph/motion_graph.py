@@ -35,11 +35,8 @@ from bodycap_batch.merging.graph.joint_distance_limits import DistanceLimit
 from bodycap_batch.merging.graph.motion_prior import add_motion_prior
 from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 from bodycap_batch.model.geometry import interpolate_pose, invert, pose_vectors, so3_log
+from bodycap_batch.model.merge_data import ON_TICK_TOLERANCE_NS
 from bodycap_batch.model.skeleton import SkeletonModel
-
-ON_TICK_TOLERANCE_NS = 1_000_000
-"""Maximum time (nanoseconds) between a measurement and a tick whose state the measurement uses. A measurement
-at a larger distance gets a separate state. In a millisecond, a hand at 3 m/s moves 3 mm."""
 
 _TOLERANCE = 1e-4
 """Minimum relative decrease of the error per step. The solver stops after a smaller decrease. Convergence is

@@ -24,7 +24,7 @@ from bodycap_batch.merging.projection.rigid_motion_solver import (
 )
 from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import invert, poses_at, rotation_angle_rad
-from bodycap_batch.model.merge_data import SolvedBody, standing_sigma_m
+from bodycap_batch.model.merge_data import ON_TICK_TOLERANCE_NS, SolvedBody, standing_sigma_m
 from bodycap_batch.model.skeleton import Motion, forward_kinematics, local_rotations
 
 _MAX_GAP_INTERVALS = 1.6
@@ -32,12 +32,6 @@ _MAX_GAP_INTERVALS = 1.6
 
 Derivation: poses of neighbouring frames are one interval apart. If one frame between them is lost, they are
 two intervals apart. The threshold is between the two values.
-"""
-
-_SNAP_NS = 1_000_000
-"""Maximum time between a camera pose and a tick, nanoseconds, to use the pose without interpolation.
-
-Evidence: none; the motion in 1 ms is below the noise.
 """
 
 
@@ -172,7 +166,7 @@ def _camera_targets(
             own_poses,
             body.times_ns(),
             max_gap_ns=round(_MAX_GAP_INTERVALS * float(interval)),
-            snap_ns=_SNAP_NS,
+            snap_ns=ON_TICK_TOLERANCE_NS,
         )
         out.append(
             CameraTarget(
