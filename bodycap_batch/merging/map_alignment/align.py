@@ -69,14 +69,12 @@ class AlignedMap:
 
     Attributes:
         gauge: Gauge of the further map.
-        cameras: Names of the further map's cameras.
         main_from_gauge: Similarity from the further map to the main map.
         sigma: Sigmas of the map's rotation, and of the positions of the map's cameras.
         reason: Reason why the map is not used; None if it is used.
     """
 
     gauge: str
-    cameras: tuple[str, ...]
     main_from_gauge: Similarity
     sigma: PoseSigma
     reason: str | None
@@ -118,11 +116,6 @@ def align_cameras(
     Returns:
         The cameras of the main map and of the aligned maps, and the reasons why other cameras are not used.
     """
-    identity = Similarity(1.0, np.eye(3), np.zeros(3))
-    if not further:
-        return UsableCameras(
-            trajectories=tuple(main), main_from_gauge={main[0].gauge: identity}, sigmas={}, unused={}
-        )
     bones = kinematic_chain(
         inputs.skeleton, {inputs.mount_of(each.camera).role for each in (*main, *further)}
     )
@@ -131,7 +124,8 @@ def align_cameras(
     for each in (*main, *further):
         track = make_track(inputs, each, index[inputs.mount_of(each.camera).role])
         tracks.setdefault(each.gauge, []).append(track)
-    found, unused = _align_all(inputs, options or MergeOptions(), bones, tracks, step)
+    found, failed = _align_all(inputs, options or MergeOptions(), bones, tracks, step)
+    failed |= {item.gauge: item.reason for item in found if item.reason is not None}
     aligned = {item.gauge: item for item in found if item.reason is None}
     transformed = [
         transform_trajectory(each, aligned[each.gauge].main_from_gauge, main[0].gauge)
@@ -140,15 +134,16 @@ def align_cameras(
     ]
     return UsableCameras(
         trajectories=(*main, *transformed),
-        main_from_gauge={main[0].gauge: identity}
-        | {gauge: item.main_from_gauge for gauge, item in aligned.items()},
-        sigmas={camera: item.sigma for item in aligned.values() for camera in item.cameras},
-        unused=unused
-        | {
-            camera: _exclusion_reason(item.gauge, main[0].camera, main[0].gauge, item.reason)
-            for item in found
-            if item.reason is not None
-            for camera in item.cameras
+        main_from_gauge={
+            main[0].gauge: Similarity(1.0, np.eye(3), np.zeros(3)),
+            **{gauge: item.main_from_gauge for gauge, item in aligned.items()},
+        },
+        sigmas={track.camera: item.sigma for gauge, item in aligned.items() for track in tracks[gauge]},
+        unused={
+            track.camera: f"the map of this camera ({gauge}) has no place in common with the map of "
+            f"{main[0].camera} ({main[0].gauge}), and the body's movement could not align the two maps: {why}"
+            for gauge, why in failed.items()
+            for track in tracks[gauge]
         },
     )
 
@@ -157,7 +152,7 @@ def _align_all(
     inputs: MergeInputs,
     options: MergeOptions,
     bones: Sequence[Bone],
-    tracks: dict[str, list[CameraTrack]],
+    tracks: Mapping[str, Sequence[CameraTrack]],
     step: Callable[[], None],
 ) -> tuple[tuple[AlignedMap, ...], dict[str, str]]:
     """Align all further maps together. If this fails, align each further map separately.
@@ -166,50 +161,36 @@ def _align_all(
         inputs: The inputs of the merge stage.
         options: Options of the merge stage. Only ``known_distance`` and ``marker_board`` are used.
         bones: The graph's bones, for all cameras.
-        tracks: By gauge, the tracks of each map. The main map is first, with the trunk's camera first. The
-            function removes maps that it cannot align.
+        tracks: By gauge, the tracks of each map. The main map is first, with the trunk's camera first.
         step: Function that is called after each iteration. It may raise an exception to stop the work.
 
     Returns:
-        The aligned maps. Also, for each camera whose map could not be aligned, the reason by camera name.
+        The aligned maps. Also, by gauge of each map that could not be aligned, the reason.
     """
     (main, (trunk, *_)), *others = tracks.items()
-    unused: dict[str, str] = {}
-
-    def exclude(gauge: str, why: str) -> None:
-        for track in tracks.pop(gauge):
-            unused[track.camera] = _exclusion_reason(gauge, trunk.camera, main, why)
-
+    failed: dict[str, str] = {}
     for gauge, group in others:
         try:
             require_common_time(trunk, group)
         except EstimationError as error:
-            exclude(gauge, error.message)
-    if len(tracks) == 1:
-        return (), unused
+            failed[gauge] = error.message
+    rest = {gauge: group for gauge, group in others if gauge not in failed}
+    if not rest:
+        return (), failed
     try:
-        return align_maps(inputs, options, bones, tracks, step), unused
+        return align_maps(inputs, options, bones, {main: tracks[main], **rest}, step), failed
     except EstimationError as error:
-        if len(tracks) == 2:
-            exclude(next(name for name in tracks if name != main), error.message)
-            return (), unused
+        if len(rest) == 1:
+            return (), {**failed, **dict.fromkeys(rest, error.message)}
     # A single map that does not fit the body makes the alignment of all maps fail. Each map is therefore
     # aligned separately.
     found: tuple[AlignedMap, ...] = ()
-    for gauge in [name for name in tracks if name != main]:
+    for gauge, group in rest.items():
         try:
-            found += align_maps(inputs, options, bones, {main: tracks[main], gauge: tracks[gauge]}, step)
+            found += align_maps(inputs, options, bones, {main: tracks[main], gauge: group}, step)
         except EstimationError as error:
-            exclude(gauge, error.message)
-    return found, unused
-
-
-def _exclusion_reason(gauge: str, trunk_camera: str, main_gauge: str, why: str) -> str:
-    """Return the message for a camera whose map could not be aligned with the trunk's map."""
-    return (
-        f"the map of this camera ({gauge}) has no place in common with the map of {trunk_camera} "
-        f"({main_gauge}), and the body's movement could not align the two maps: {why}"
-    )
+            failed[gauge] = error.message
+    return found, failed
 
 
 def _initialise(
@@ -277,11 +258,11 @@ def align_maps(
     together = _without_outliers(inputs, together, provisional)
     samples = take_samples(together, provisional, MAX_SAMPLES, None if up is None else up.up)
     calibration = CalibrationGraph(inputs.skeleton, bones, samples, mounts, provisional, step)
-    names = {gauge: tuple(track.camera for track in group) for gauge, group in others}
+    cameras = [tuple(track.camera for track in group) for _, group in others]
     observable_sigma = _REACH_SIGMA if alignment.one_map_spans_a_limb else _SEPARATE_MAPS_SIGMA
     reach_sigma = observable_sigma if alignment.scale_observable else _UNOBSERVABLE_SIGMA
     problem = MapAlignmentProblem(
-        calibration, list(names.values()), provisional, reach_sigma=reach_sigma, stated=stated.scales
+        calibration, cameras, provisional, reach_sigma=reach_sigma, stated=stated.scales
     )
     problem.solve()
     # A scale that the job gives may contradict the limbs' reach. Only other scales must agree with the reach.
@@ -297,7 +278,7 @@ def align_maps(
         floor = scale_from_walked_floor(inputs, together[0], up, problem.scale(), points)
         problem.add_scale_sources(() if floor is None else (floor,))
     out = []
-    for index, (gauge, cameras) in enumerate(names.items()):
+    for index, (gauge, _) in enumerate(others):
         sigma = problem.sigmas(index)
         why = None
         if not sigma.position_m <= MAX_SIGMA_M:
@@ -310,7 +291,6 @@ def align_maps(
         out.append(
             AlignedMap(
                 gauge=gauge,
-                cameras=cameras,
                 main_from_gauge=problem.corrections[index].after(initial[gauge]),
                 sigma=sigma,
                 reason=why,

@@ -306,7 +306,6 @@ def test_one_bad_map_does_not_exclude_the_others(capture, monkeypatch):
         return (
             AlignedMap(
                 gauge="good",
-                cameras=("left_palm",),
                 main_from_gauge=here,
                 sigma=PoseSigma(0.01, 0.01),
                 reason=None,
