@@ -59,8 +59,7 @@ SUBLAYERS: dict[str, Sequence[set[str]]] = {
         {"world"},
         {"body_calibration"},
         {"map_alignment", "reporting"},
-        {"main_map", "camera_paths"},
-        {"camera_selection", "unfit_camera"},
+        {"main_map", "camera_paths", "rig_priors", "unfit_camera"},
         {"stage"},
     ),
 }

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.fill.trunk_signals import TrunkSignals, oscillation_amplitude
+from bodycap_batch.fill.trunk_signals import ORDINARY_SPEED_M_PER_S, TrunkSignals, oscillation_amplitude
+from bodycap_batch.model.gravity import GRAVITY_M_S2
 
 STAND, LEFT, RIGHT, LEFT_TO_RIGHT, RIGHT_TO_LEFT, FLIGHT_LEFT, FLIGHT_RIGHT, FLIGHT_BOTH = range(8)
 """The states. The names of the flights say which foot left the floor last."""
@@ -57,8 +58,6 @@ _LAG_S = 0.03
 docs/decisions/filling.md."""
 _MAX_EVIDENCE = 1.5
 """Maximum evidence (nats) of one signal at one tick. Evidence: none."""
-_GRAVITY = 9.81
-"""Acceleration of free fall, m/s². Origin: standard gravity."""
 _FLIGHT_SIGMA = 3.0
 """Standard deviation (m/s²) of the trunk's acceleration around free fall during a flight. Evidence: none."""
 _FLIGHT_MARGIN = 4.0
@@ -191,10 +190,6 @@ class _Evidence:
     by_state: FloatArray
     by_signal: FloatArray
 
-    def parts(self) -> tuple[FloatArray, FloatArray]:
-        """Return all arrays."""
-        return self.by_state, self.by_signal
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Rhythm:
@@ -250,11 +245,11 @@ def find_contacts(signals: TrunkSignals, standing_m: float | None = None) -> Con
     ticks = len(signals.heading_rad)
     chosen = np.arange(0, ticks, stride)
     evidence = _evidence(signals, signals.fps / stride, standing_m)
-    evidence = _Evidence(*(_advanced(part, signals.fps) for part in evidence.parts()))
-    coarse = _Evidence(evidence.by_state[chosen], evidence.by_signal[chosen])
-    period_s = _step_period_s(signals)[chosen]
-    share = _double_share(signals)[chosen]
-    rhythm = _Rhythm(period_s=period_s, share=share, firmness=np.ones(len(chosen)))
+    coarse = _Evidence(
+        _advanced(evidence.by_state, signals.fps)[chosen], _advanced(evidence.by_signal, signals.fps)[chosen]
+    )
+    period_s, share = _step_period_s(signals), _double_share(signals)
+    rhythm = _Rhythm(period_s=period_s[chosen], share=share[chosen], firmness=np.ones(len(chosen)))
     found = _viterbi(coarse.by_state, rhythm, signals.fps / stride)
     # The second pass expects the person's own rhythm, which the first pass has found.
     rhythm = _own_rhythm(found, rhythm, signals.fps / stride)
@@ -262,7 +257,7 @@ def find_contacts(signals: TrunkSignals, standing_m: float | None = None) -> Con
     height = signals.slow_hips_m[:, 2]
     ordinary = _StepSignals(
         fps=signals.fps / stride,
-        period_s=period_s,
+        period_s=period_s[chosen],
         speed=signals.speed_m_per_s()[chosen],
         sinking=(height - np.median(height))[chosen],
         alternating=np.column_stack([signals.sway_m_per_s2, signals.twist_rad_per_s, signals.arm_m_per_s])[
@@ -275,13 +270,12 @@ def find_contacts(signals: TrunkSignals, standing_m: float | None = None) -> Con
     sure = _sure_ticks(found, coarse, ordinary)
     nearest = np.minimum(np.round(np.arange(ticks) / stride).astype(np.int64), len(chosen) - 1)
     state = found[nearest]
-    period, double = _step_period_s(signals), _double_share(signals)
     return Contacts(
         state=state,
         standing=_STANDING[state],
         is_sure=sure[nearest],
-        single_s=(1.0 - double) * period,
-        double_s=double * period,
+        single_s=(1.0 - share) * period_s,
+        double_s=share * period_s,
     )
 
 
@@ -331,7 +325,7 @@ def _evidence(signals: TrunkSignals, coarse_fps: float, standing_m: float | None
     spread = 0.5 * (_STEPPING_SPEED - _STILL_SPEED)
     middle = 0.5 * (_STEPPING_SPEED + _STILL_SPEED)
     stepping = np.clip((speed - middle) / spread, -2.0, 4.0)
-    flight = -0.5 * ((signals.rise_m_per_s2 + _GRAVITY) / _FLIGHT_SIGMA) ** 2 + _FLIGHT_MARGIN
+    flight = -0.5 * ((signals.rise_m_per_s2 + GRAVITY_M_S2) / _FLIGHT_SIGMA) ** 2 + _FLIGHT_MARGIN
     out = np.zeros((len(speed), _STATES))
     out[:, STAND] = -stepping
     out[:, LEFT] = 0.5 * (single + side)
@@ -344,7 +338,7 @@ def _evidence(signals: TrunkSignals, coarse_fps: float, standing_m: float | None
 def _step_period_s(signals: TrunkSignals) -> FloatArray:
     """Return the expected time (T,) between two steps, seconds."""
     speed = np.maximum(signals.speed_m_per_s(), _MIN_CADENCE_SPEED)
-    period = 1.0 / (_STEP_HZ_AT_1_3 * (speed / 1.3) ** _STEP_HZ_EXPONENT)
+    period = 1.0 / (_STEP_HZ_AT_1_3 * (speed / ORDINARY_SPEED_M_PER_S) ** _STEP_HZ_EXPONENT)
     forward = (signals.velocity_m_per_s[:, :2] * signals.forward()).sum(axis=1)
     is_aside = forward < (1.0 - _ASIDE_SHARE) * speed
     return np.asarray(np.where(is_aside, np.minimum(period, _ASIDE_STEP_S), period))
@@ -371,7 +365,7 @@ def _own_rhythm(state: IntArray, rhythm: _Rhythm, fps: float) -> _Rhythm:
 
 def _double_share(signals: TrunkSignals) -> FloatArray:
     """Return the expected share (T,) of a step during which both feet stand."""
-    share = _DOUBLE_SHARE + _DOUBLE_SHARE_PER_SPEED * (signals.speed_m_per_s() - 1.3)
+    share = _DOUBLE_SHARE + _DOUBLE_SHARE_PER_SPEED * (signals.speed_m_per_s() - ORDINARY_SPEED_M_PER_S)
     return np.asarray(np.clip(share, 0.08, 0.4))
 
 

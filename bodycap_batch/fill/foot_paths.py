@@ -13,6 +13,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.fill.leg_geometry import LegGeometry, soft_length
+from bodycap_batch.fill.trunk_signals import ORDINARY_SPEED_M_PER_S
 from bodycap_batch.model.fill_data import Footsteps
 
 _HEEL_RISE_RAD = np.radians(62.0)
@@ -21,10 +22,8 @@ Control of Human Movement", 4th ed., fig. 3.30 (foot angle)."""
 _MAX_HEEL_RISE_RAD = np.radians(70.0)
 """Maximum angle of the foot on its ball. Evidence: none."""
 _HEEL_STRIKE_RAD = np.radians(20.0)
-"""Angle of the raised toes when the heel touches the floor, at 1.3 m/s. Source: as `_HEEL_RISE_RAD`."""
-_FULL_SPEED = 1.3
-"""Speed (m/s) for which these angles hold. They are proportional to the square root of the speed of the
-person. Evidence for the root: none."""
+"""Angle of the raised toes when the heel touches the floor, at 1.3 m/s. Source: as `_HEEL_RISE_RAD`. Both
+angles are proportional to the square root of the speed of the person. Evidence for the root: none."""
 _HEEL_RISE_SHARE = 0.42
 """Share of the time on the floor during which the heel is raised, before a step. Source: as
 `_HEEL_RISE_RAD`."""
@@ -138,15 +137,7 @@ def kept_steps(steps: Footsteps, missed: BoolArray) -> Footsteps:
         first, count = (int(own[0]), int(own[-1] - own[0]) + 1) if len(own) else (0, 0)
         starts[index] += first
         ends[index] = starts[index] + count
-    kept = ends > starts
-    return Footsteps(
-        side=steps.side[kept],
-        start_tick=starts[kept],
-        end_tick=ends[kept],
-        ankle_in_world_m=steps.ankle_in_world_m[kept],
-        heading_rad=steps.heading_rad[kept],
-        is_sure=steps.is_sure[kept],
-    )
+    return replace(steps, start_tick=starts, end_tick=ends).keep(ends > starts)
 
 
 def _within_reach(place: FloatArray, hip: FloatArray, limit_m: float) -> FloatArray:
@@ -234,7 +225,7 @@ def _strength(first: _Stance, second: _Stance, fps: float) -> float:
     ahead = float(apart @ [np.sin(first.heading), -np.cos(first.heading)])
     middle = 0.5 * (second.start + second.end - first.start - first.end)
     speed = ahead / max(middle / fps, 1.0 / fps)
-    return float(np.sqrt(np.clip(speed / _FULL_SPEED, 0.02, 1.2)))
+    return float(np.sqrt(np.clip(speed / ORDINARY_SPEED_M_PER_S, 0.02, 1.2)))
 
 
 def _stand(

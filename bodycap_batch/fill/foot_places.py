@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, runs
 from bodycap_batch.fill.contacts import LEFT, RIGHT, STAND, Contacts
 from bodycap_batch.fill.leg_geometry import LegGeometry
 from bodycap_batch.fill.trunk_signals import TrunkSignals
@@ -126,12 +126,9 @@ def _keep_apart(places: FloatArray, stances: list[_Stance], signals: TrunkSignal
 
 
 def _stances(contacts: Contacts, side: int) -> list[_Stance]:
-    mask = contacts.standing[:, side]
-    padded = np.concatenate([[False], mask, [False]]).astype(np.int8)
-    starts, ends = np.flatnonzero(np.diff(padded) == 1), np.flatnonzero(np.diff(padded) == -1)
     return [
-        _Stance(side, int(start), int(end), bool(contacts.is_sure[start:end].all()))
-        for start, end in zip(starts, ends, strict=True)
+        _Stance(side, start, end, bool(contacts.is_sure[start:end].all()))
+        for start, end in runs(contacts.standing[:, side])
     ]
 
 

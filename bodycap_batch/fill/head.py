@@ -6,7 +6,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.fill.trunk_signals import TrunkSignals, low_pass
-from bodycap_batch.model.geometry import interpolate_pose, make_transform, rotation_angle_rad, so3_exp
+from bodycap_batch.model.geometry import interpolate_rotation, rotation_angle_rad, so3_exp
 
 _AHEAD_S = 0.25
 """Time (s) by which the head turns before the trunk. Source: R. Grasso and others, "Eye-head coordination for
@@ -41,9 +41,5 @@ def head_rotations(
     angle = rotation_angle_rad(np.swapaxes(trunk, -1, -2) @ head)
     bent = _MAX_BEND_RAD * np.tanh(angle / _MAX_BEND_RAD) / np.maximum(angle, 1e-9)
     share = (1.0 - reclined) * np.where(angle > 1e-6, bent, 1.0)
-    head = interpolate_pose(make_transform(trunk, np.zeros(3)), make_transform(head, np.zeros(3)), share)
-    head = head[:, :3, :3]
-    neck = interpolate_pose(
-        make_transform(trunk, np.zeros(3)), make_transform(head, np.zeros(3)), np.full(ticks, _NECK_SHARE)
-    )[:, :3, :3]
-    return np.asarray(neck), np.asarray(head)
+    head = interpolate_rotation(trunk, head, share)
+    return interpolate_rotation(trunk, head, np.full(ticks, _NECK_SHARE)), head

@@ -9,11 +9,7 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.fill_data import SIDES
 from bodycap_batch.model.skeleton import SkeletonModel
-from bodycap_batch.model.skeleton_presets import rest_positions
-
-_ANKLE_OVER_LEG = 0.039 / 0.491
-"""Ratio of the ankle's height above the sole to the length of the leg. Source: R. Drillis, R. Contini, "Body
-segment parameters", 1966."""
+from bodycap_batch.model.skeleton_presets import ANKLE_OVER_LEG, rest_positions
 
 _FLAT_TOLERANCE_M = 0.02
 """Maximum difference (metres) between the drop from ankle to toe in the zero pose and the height of the ankle
@@ -151,21 +147,20 @@ def _one_leg(skeleton: SkeletonModel, side: str) -> LegGeometry | None:
     if None in joints:
         return None
     hip, knee, ankle = (joint for joint in joints if joint is not None)
-    parents = skeleton.parents.tolist()
-    if not (_is_below(parents, knee, hip) and _is_below(parents, ankle, knee)):
+    if knee not in skeleton.subtree(hip) or ankle not in skeleton.subtree(knee):
         return None
     rest = rest_positions(skeleton)
     thigh, shin = rest[knee] - rest[hip], rest[ankle] - rest[knee]
     length = float(np.linalg.norm(thigh) + np.linalg.norm(shin))
     toe = skeleton.index_of_role(side + "ToeBase")
-    below = tuple(j for j in range(len(parents)) if j != ankle and _is_below(parents, j, ankle))
+    below = tuple(skeleton.subtree(ankle)[1:])
     ends = [rest[j] + np.nan_to_num(skeleton.end_offsets_m[j]) - rest[ankle] for j in (ankle, *below)]
     tip = max(ends, key=lambda end: float(np.hypot(end[0], end[1])))
     if np.hypot(tip[0], tip[1]) < 0.25 * _FOOT_OVER_LEG * length:
         # A foot that ends at the ankle cannot touch the floor with its toes.
         tip = np.zeros(3)
     ball = tip if toe is None else rest[toe] - rest[ankle]
-    ankle_height = _ANKLE_OVER_LEG * length
+    ankle_height = ANKLE_OVER_LEG * length
     pitch = 0.0
     drop = float(-tip[2])
     if abs(drop - ankle_height) <= _FLAT_TOLERANCE_M:
@@ -175,11 +170,8 @@ def _one_leg(skeleton: SkeletonModel, side: str) -> LegGeometry | None:
         wanted = np.arcsin(np.clip((ankle_height - _TOE_HEIGHT_M) / reach, 0.0, 0.8))
         pitch = float(wanted - np.arcsin(np.clip(drop / reach, -1.0, 1.0)))
         ankle_height = float(reach * np.sin(wanted)) + _TOE_HEIGHT_M
-    chain = [hip]
-    while chain[-1] != 0:
-        chain.append(parents[chain[-1]])
     return LegGeometry(
-        chain=tuple(reversed(chain[:-1])),
+        chain=tuple(reversed(skeleton.path_to_root(hip)[:-1])),
         hip=hip,
         knee=knee,
         ankle=ankle,
@@ -192,9 +184,3 @@ def _one_leg(skeleton: SkeletonModel, side: str) -> LegGeometry | None:
         flat_pitch_rad=pitch,
         ankle_height_m=ankle_height,
     )
-
-
-def _is_below(parents: list[int], joint: int, ancestor: int) -> bool:
-    while joint > ancestor:
-        joint = parents[joint]
-    return joint == ancestor

@@ -6,8 +6,8 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.fill.leg_geometry import LegGeometry
-from bodycap_batch.model.geometry import interpolate_pose, make_transform, so3_exp
-from bodycap_batch.model.skeleton import SkeletonModel
+from bodycap_batch.model.geometry import interpolate_rotation, so3_exp
+from bodycap_batch.model.skeleton import SkeletonModel, pose_joint
 
 _POINTED_RAD = (float(np.radians(25.0)), float(np.radians(75.0)))
 """Angles by which the toes of a person who lies on the back, and on the front, are lowered against the
@@ -34,7 +34,7 @@ def lay_legs(
     if len(ticks) == 0:
         return
     parents = skeleton.parents
-    joints = _joints_below(skeleton, leg.hip)
+    joints = skeleton.subtree(leg.hip)
     poses = world[ticks]
     local = {
         joint: np.swapaxes(poses[:, parents[joint], :3, :3], -1, -2) @ poses[:, joint, :3, :3]
@@ -47,9 +47,10 @@ def lay_legs(
         target = np.tile(np.eye(3), (len(ticks), 1, 1))
         if joint == leg.ankle:
             target = so3_exp(np.column_stack([pointed, zero, zero]))
-        local[joint] = _between(local[joint], target, share[ticks])
+        local[joint] = interpolate_rotation(local[joint], target, share[ticks])
     for _ in range(_CORRECTIONS):
-        _write(skeleton, joints, local, poses)
+        for joint in joints:
+            pose_joint(skeleton, joint, poses, local[joint])
         low = _lowest_m(skeleton, leg, poses) - floor_m
         if low.min() >= 0.0:
             break
@@ -57,30 +58,6 @@ def lay_legs(
             poses, leg, parents, local[leg.hip], np.minimum(low - _ROOM_M, 0.0) * (low < 0.0)
         )
     world[ticks] = poses
-
-
-def _joints_below(skeleton: SkeletonModel, top: int) -> list[int]:
-    """Return a joint and all joints below it, parents first."""
-    out = [top]
-    for joint in range(top + 1, len(skeleton.joints)):
-        if int(skeleton.parents[joint]) in out:
-            out.append(joint)
-    return out
-
-
-def _between(first: FloatArray, second: FloatArray, share: FloatArray) -> FloatArray:
-    zero = np.zeros(3)
-    return np.asarray(
-        interpolate_pose(make_transform(first, zero), make_transform(second, zero), share)[:, :3, :3]
-    )
-
-
-def _write(
-    skeleton: SkeletonModel, joints: list[int], local: dict[int, FloatArray], poses: FloatArray
-) -> None:
-    for joint in joints:
-        own = make_transform(local[joint], skeleton.offsets_m[joint])
-        poses[:, joint] = poses[:, skeleton.parents[joint]] @ own
 
 
 def _lowest_m(skeleton: SkeletonModel, leg: LegGeometry, poses: FloatArray) -> FloatArray:

@@ -6,21 +6,19 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.fill.contacts import STAND, Contacts
-from bodycap_batch.fill.trunk_signals import TrunkSignals, low_pass
+from bodycap_batch.fill.trunk_signals import ORDINARY_SPEED_M_PER_S, STEP_HZ, TrunkSignals, low_pass
 from bodycap_batch.model.fill_data import Footsteps
-from bodycap_batch.model.geometry import interpolate_pose, make_transform, so3_exp
-from bodycap_batch.model.skeleton import SkeletonModel
+from bodycap_batch.model.geometry import interpolate_rotation, so3_exp
 
 _YAW_RAD = np.radians(3.0)
 """Amplitude of the pelvis's yaw with each stride, at 1.3 m/s. Source: M. P. Murray, A. B. Drought, R. C.
 Kory, "Walking patterns of normal men", Journal of Bone and Joint Surgery 46-A, 1964: ± 3 to 5°. The smaller
 value, because the turn that reaches the feet is added."""
 _LIST_RAD = np.radians(3.5)
-"""Amplitude of the pelvis's list with each stride, at 1.3 m/s. Source: as `_YAW_RAD`."""
-_FULL_SPEED = 1.3
-"""Speed (m/s) for which these amplitudes hold. They are proportional to the speed."""
+"""Amplitude of the pelvis's list with each stride, at 1.3 m/s. Source: as `_YAW_RAD`. Both amplitudes are
+proportional to the speed."""
 _FOLLOWING_RAD = (float(np.radians(20.0)), float(np.radians(70.0)))
 """Angles of the trunk against the vertical from which the pelvis starts to follow it, and follows it most.
 Evidence: none."""
@@ -47,8 +45,6 @@ _DIFFERENCE_RAD = 1e-3
 """Angle (radians) of the numeric derivative of the hip joints. Derivation: it moves them by 0.1 mm."""
 _CORRECTIONS = 3
 """Number of linear corrections. Evidence: none."""
-_TURN_HZ = 4.0
-"""Cutoff frequency (Hz) of this turn. Derivation: twice the frequency of ordinary steps."""
 _FADE_HZ = 1.5
 """Cutoff frequency (Hz) of the start and the end of these rotations. Evidence: none."""
 
@@ -98,13 +94,8 @@ def following_pelvis(pelvis: FloatArray, trunk: FloatArray, reclined: FloatArray
         trunk: (T,3,3) orientation of the trunk in the world.
         reclined: (T,) 1 for a lying person.
     """
-    zero = np.zeros(3)
-    share = _smooth_step(_tilt_rad(trunk), _FOLLOWING_RAD) * (
-        _BOWING_SHARE + (1.0 - _BOWING_SHARE) * reclined
-    )
-    return np.asarray(
-        interpolate_pose(make_transform(pelvis, zero), make_transform(trunk, zero), share)[:, :3, :3]
-    )
+    most = _BOWING_SHARE + (1.0 - _BOWING_SHARE) * reclined
+    return interpolate_rotation(pelvis, trunk, _smooth_step(_tilt_rad(trunk), _FOLLOWING_RAD) * most)
 
 
 def _tilt_rad(rotation: FloatArray) -> FloatArray:
@@ -133,7 +124,9 @@ def pelvis_rotation(
     if has_gait:
         phase = stride_phase_rad(steps, ticks)
         walking = low_pass((contacts.state != STAND).astype(np.float64), _FADE_HZ, signals.fps)
-        strength = np.clip(walking, 0.0, 1.0) * np.clip(signals.speed_m_per_s() / _FULL_SPEED, 0.0, 1.3)
+        strength = np.clip(walking, 0.0, 1.0) * np.clip(
+            signals.speed_m_per_s() / ORDINARY_SPEED_M_PER_S, 0.0, 1.3
+        )
         yaw = yaw - _YAW_RAD * strength * np.cos(phase)
         tilt = -_LIST_RAD * strength * np.sin(phase)
     turn = so3_exp(np.column_stack([zero, zero, yaw]))
@@ -178,33 +171,4 @@ def reaching_pelvis(
         solved = np.linalg.solve(damped, excess[:, :, None])[:, :, 0]
         turn = turn - _AXIS_WEIGHTS * np.einsum("tij,ti->tj", slopes, solved)
         turn = _MAX_TURN_RAD * np.tanh(turn / _MAX_TURN_RAD)
-    return np.asarray(pelvis @ so3_exp(low_pass(turn, _TURN_HZ, fps)))
-
-
-def bend_spine(
-    skeleton: SkeletonModel, first: int, pelvis: FloatArray, world: FloatArray, filled: BoolArray
-) -> None:
-    """Write the poses of the joints above the first measured joint: root, lower spine and their helpers.
-
-    Args:
-        skeleton: The skeleton.
-        first: Index of the first measured joint.
-        pelvis: (T,3,3) orientation of the pelvis.
-        world: (T,J,4,4) poses in the world; changed in place.
-        filled: (J,) which joints are filled; changed in place.
-    """
-    chain = [first]
-    while chain[-1] != 0:
-        chain.append(int(skeleton.parents[chain[-1]]))
-    last = len(chain) - 1
-    bending = [step for step in range(1, len(chain)) if skeleton.roles[chain[step]] or step == last]
-    trunk = make_transform(world[:, first, :3, :3], np.zeros(3))
-    target = make_transform(pelvis, np.zeros(3))
-    for step in range(1, len(chain)):
-        child, joint = chain[step - 1], chain[step]
-        fraction = np.full(len(world), (np.searchsorted(bending, step) + 1) / len(bending))
-        rotation = interpolate_pose(trunk, target, fraction)[:, :3, :3]
-        world[:, joint] = make_transform(
-            rotation, world[:, child, :3, 3] - rotation @ skeleton.offsets_m[child]
-        )
-        filled[joint] = True
+    return np.asarray(pelvis @ so3_exp(low_pass(turn, STEP_HZ, fps)))

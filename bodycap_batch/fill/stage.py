@@ -16,18 +16,11 @@ from bodycap_batch.fill.head import head_rotations
 from bodycap_batch.fill.leg_geometry import LegGeometry, leg_geometry
 from bodycap_batch.fill.leg_poses import pose_leg
 from bodycap_batch.fill.lying import lay_legs
-from bodycap_batch.fill.pelvis import (
-    bend_spine,
-    following_pelvis,
-    pelvis_rotation,
-    reaching_pelvis,
-    reclined_share,
-)
+from bodycap_batch.fill.pelvis import following_pelvis, pelvis_rotation, reaching_pelvis, reclined_share
 from bodycap_batch.fill.standing_height import HeightSigmas, StandingHeight, raised_pelvis, standing_height
 from bodycap_batch.fill.trunk_signals import TrunkSignals, trunk_signals
 from bodycap_batch.model.fill_data import SIDES, FillMode, FillReport, FillResult, Footsteps
-from bodycap_batch.model.geometry import make_transform
-from bodycap_batch.model.skeleton import Motion, SkeletonModel
+from bodycap_batch.model.skeleton import Motion, SkeletonModel, bend_spine, local_rotations, pose_joint
 from bodycap_batch.model.skeleton_presets import split_side
 
 _PROGRESS_STEPS = 4
@@ -78,20 +71,18 @@ def fill_motion(
     contacts = find_contacts(signals, standing_m)
     context.check_cancelled()
     context.progress(1, _PROGRESS_STEPS, "steps")
-    steps = nothing.footsteps
-    if legs is not None:
-        steps = place_feet(contacts, signals, legs, floor.floor_m)
+    steps = nothing.footsteps if legs is None else place_feet(contacts, signals, legs, floor.floor_m)
     context.progress(2, _PROGRESS_STEPS, "pelvis")
     reclined = np.zeros(len(world))
-    may_lie = is_on(Mechanism.LYING)
-    if may_lie and legs is not None and split_side(skeleton.roles[first])[0] == "":
+    if is_on(Mechanism.LYING) and legs is not None and split_side(skeleton.roles[first])[0] == "":
         reclined = reclined_share(world[:, first], floor.floor_m, legs[0].length_m)
     if first != 0:
         pelvis = pelvis_rotation(signals, contacts, steps, legs is not None)
         pelvis = following_pelvis(pelvis, world[:, first, :3, :3], reclined)
         if legs is not None:
             pelvis = _within_reach(skeleton, first, pelvis, world, (legs, steps, signals))
-        bend_spine(skeleton, first, pelvis, world, filled)
+        bend_spine(skeleton, first, world[:, first, :3, :3], pelvis, world)
+        filled[skeleton.path_to_root(first)[1:]] = True
     missed = np.ones_like(contacts.standing)
     if legs is not None:
         steps, missed = _fill_legs(skeleton, legs, steps, signals, world, filled)
@@ -105,10 +96,10 @@ def fill_motion(
     context.progress(3, _PROGRESS_STEPS, "head")
     _fill_head(skeleton, solved, (signals, reclined), world, filled)
     _follow_parents(skeleton, solved, filled, motion.local_rotation, world)
-    local = _local_rotations(skeleton, world)
-    local[:, solved & _parent_kept(skeleton, filled)] = motion.local_rotation[
-        :, solved & _parent_kept(skeleton, filled)
-    ]
+    local = local_rotations(skeleton, world[..., :3, :3])
+    # A joint whose parent was not filled keeps its local rotation.
+    kept = solved & ~filled[np.maximum(skeleton.parents, 0)]
+    local[:, kept] = motion.local_rotation[:, kept]
     sure = nothing.is_sure
     if legs is not None:
         known = _trunk_is_seen(motion, solved) & ~_low_hips(world, legs, floor) & (reclined == 0.0)
@@ -205,10 +196,10 @@ def _within_reach(
 
     def hips_of(rotation: FloatArray) -> FloatArray:
         poses = world.copy()
-        bend_spine(skeleton, first, rotation, poses, np.zeros(len(skeleton.joints), dtype=bool))
+        bend_spine(skeleton, first, world[:, first, :3, :3], rotation, poses)
         for leg in legs:
             for joint in leg.chain:
-                _rotate_with_parent(skeleton, joint, poses)
+                pose_joint(skeleton, joint, poses)
         return np.stack([poses[:, leg.hip, :3, 3] for leg in legs], axis=1)
 
     paths = [
@@ -238,7 +229,7 @@ def _fill_legs(
     missed = np.zeros((len(world), len(legs)), dtype=bool)
     for leg in legs:
         for joint in leg.chain:
-            _rotate_with_parent(skeleton, joint, world)
+            pose_joint(skeleton, joint, world)
     hips = np.stack([world[:, leg.hip, :3, 3] for leg in legs], axis=1)
     steps = reachable_steps(steps, legs, hips, signals.fps)
     for side, leg in enumerate(legs):
@@ -247,16 +238,14 @@ def _fill_legs(
         if path is None:
             continue
         pose = pose_leg(leg, hip, path, world[:, 0, :3, :3])
-        for joint in leg.chain:
-            filled[joint] = True
         world[:, leg.hip, :3, :3] = pose.thigh
         _place_below(skeleton, leg.hip, leg.knee, world)
         world[:, leg.knee, :3, :3] = pose.shin
         _place_below(skeleton, leg.knee, leg.ankle, world)
         world[:, leg.ankle, :3, :3] = pose.foot
-        filled[[leg.hip, leg.knee, leg.ankle, *leg.below]] = True
+        filled[[*leg.chain, leg.knee, leg.ankle, *leg.below]] = True
         for joint in leg.below:
-            _rotate_with_parent(skeleton, joint, world)
+            pose_joint(skeleton, joint, world)
             if joint == leg.toe:
                 world[:, joint, :3, :3] = pose.toe
         missed[:, side] = np.linalg.norm(world[:, leg.ankle, :3, 3] - path.ankle_m, axis=1) > _MAX_MISS_M
@@ -281,24 +270,16 @@ def _fill_head(
     rotations = head_rotations(trunk[0], world[:, start, :3, :3], trunk[1])
     for joint, rotation in ((neck, rotations[0]), (head, rotations[1])):
         if joint is not None:
-            _rotate_with_parent(skeleton, joint, world)
+            pose_joint(skeleton, joint, world)
             world[:, joint, :3, :3] = rotation
             filled[joint] = True
 
 
-def _rotate_with_parent(skeleton: SkeletonModel, joint: int, world: FloatArray) -> None:
-    """Write the pose of a joint without rotation relative to its parent."""
-    parent = int(skeleton.parents[joint])
-    world[:, joint] = world[:, parent] @ make_transform(np.eye(3), skeleton.offsets_m[joint])
-
-
 def _place_below(skeleton: SkeletonModel, upper: int, lower: int, world: FloatArray) -> None:
     """Write the pose of each joint between two joints, the lower one included, without rotation."""
-    chain = [lower]
-    while chain[-1] != upper:
-        chain.append(int(skeleton.parents[chain[-1]]))
-    for joint in reversed(chain[:-1]):
-        _rotate_with_parent(skeleton, joint, world)
+    path = skeleton.path_to_root(lower)
+    for joint in reversed(path[: path.index(upper)]):
+        pose_joint(skeleton, joint, world)
 
 
 def _follow_parents(
@@ -307,24 +288,7 @@ def _follow_parents(
     """Write the poses of all other joints: they keep their rotation relative to the parent."""
     for joint in range(1, len(solved)):
         if not solved[joint] and not filled[joint]:
-            parent = int(skeleton.parents[joint])
-            own = make_transform(local[:, joint], skeleton.offsets_m[joint])
-            world[:, joint] = world[:, parent] @ own
-
-
-def _local_rotations(skeleton: SkeletonModel, world: FloatArray) -> FloatArray:
-    rotation = world[..., :3, :3]
-    out = rotation.copy()
-    parents = skeleton.parents[1:]
-    out[:, 1:] = np.swapaxes(rotation[:, parents], -1, -2) @ rotation[:, 1:]
-    return out
-
-
-def _parent_kept(skeleton: SkeletonModel, filled: BoolArray) -> BoolArray:
-    """Return (J,) True for a joint whose parent was not filled, so that its local rotation is unchanged."""
-    out = np.ones(len(filled), dtype=bool)
-    out[1:] = ~filled[skeleton.parents[1:]]
-    return out
+            pose_joint(skeleton, joint, world, local[:, joint])
 
 
 def _standing(steps: Footsteps, missed: BoolArray) -> BoolArray:

@@ -153,9 +153,7 @@ def raised_pelvis(motion: Motion, first: int, by_m: float) -> Motion:
         by_m: Distance (metres) by which the root is nearer to it.
     """
     skeleton = motion.skeleton
-    chain = [first]
-    while skeleton.parents[chain[-1]] != 0:
-        chain.append(int(skeleton.parents[chain[-1]]))
+    chain = skeleton.path_to_root(first)[:-1]
     offsets = skeleton.offsets_m.copy()
     offsets[chain] *= 1.0 - by_m / float(np.linalg.norm(offsets[chain].sum(axis=0)))
     shorter = replace(motion, skeleton=replace(skeleton, offsets_m=offsets))

@@ -12,12 +12,14 @@ from bodycap_batch.model.skeleton import Motion
 _SLOW_HZ = 0.7
 """Cutoff frequency (Hz) of the path and heading without the sway of single steps. Derivation: a stride, which
 is the period of the sway, takes 1.0 to 1.4 s at ordinary speeds."""
-_STEP_HZ = 4.0
+STEP_HZ = 4.0
 """Cutoff frequency (Hz) of the rise and fall with each step. Derivation: twice the frequency of ordinary
 steps, 2 Hz."""
 _STRIDE_HZ = 2.5
 """Cutoff frequency (Hz) of sway, yaw and arm swing, which repeat with each stride. Derivation: more than
 twice the frequency of ordinary strides, 1 Hz."""
+ORDINARY_SPEED_M_PER_S = 1.3
+"""Speed (m/s) of an ordinary walk, for which the sources state durations and angles."""
 _MIN_TICKS = 16
 """Minimum number of ticks of a filtered signal. Derivation: the padding of the filter."""
 
@@ -81,7 +83,7 @@ def trunk_signals(motion: Motion, trunk: int, hands: tuple[int | None, int | Non
     forward = np.column_stack([np.sin(heading), -np.cos(heading)])
     slow = low_pass(hips, _SLOW_HZ, fps)
     sway = low_pass(hips, _STRIDE_HZ, fps)[:, :2] - slow[:, :2]
-    height = low_pass(poses[:, trunk, 2, 3], _STEP_HZ, fps)
+    height = low_pass(poses[:, trunk, 2, 3], STEP_HZ, fps)
     arm = np.zeros(len(hips))
     if hands[0] is not None and hands[1] is not None:
         apart = poses[:, hands[0], :2, 3] - poses[:, hands[1], :2, 3]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.arrays import IntArray
 from bodycap_batch.merging.cameras.track import CameraTrack, is_uncalibrated, transform_trajectory
 from bodycap_batch.merging.graph.motion_graph import MotionSolution
 from bodycap_batch.model.geometry import Similarity
@@ -69,21 +69,6 @@ def with_solved_centres(
     if mount.slip is not None:
         solved = mount.slip.as_moved(solved, track.times_ns)
     poses = np.array(trajectory.gauge_from_cam)
-    poses[track.frames] = _blend_centres(poses[track.frames], solved, solution.weights[track.camera])
+    measured, weight = poses[track.frames, :3, 3], solution.residuals[track.camera].weights
+    poses[track.frames, :3, 3] = measured + weight[:, None] * (solved[:, :3, 3] - measured)
     return replace(trajectory, gauge_from_cam=poses)
-
-
-def _blend_centres(measured: FloatArray, solved: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return measured poses (N,4,4) with each centre moved towards the solved centre by a weight.
-
-    Args:
-        measured: (N,4,4) measured camera poses.
-        solved: (N,4,4) solved camera poses.
-        weight: (N,) fraction of the way to the solved centre.
-
-    Returns:
-        (N,4,4) poses with moved centres.
-    """
-    out = measured.copy()
-    out[:, :3, 3] += weight[:, None] * (solved[:, :3, 3] - measured[:, :3, 3])
-    return out

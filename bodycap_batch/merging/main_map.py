@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import permutations
-from typing import NamedTuple
 
 from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.provisional_scale import reach_constraint
-from bodycap_batch.merging.cameras.excluded_cameras import excluded_cameras
 from bodycap_batch.merging.map_alignment.align import UsableCameras, align_cameras
 from bodycap_batch.model.merge_data import MergeInputs
 from bodycap_batch.model.scene import Trajectory
@@ -41,23 +39,11 @@ _MAP_HINT = (
 """Advice if no map holds enough cameras."""
 
 
-class MainMapCandidate(NamedTuple):
-    """A map that may become the main map.
-
-    Attributes:
-        cameras: Trajectories in this map. The trajectory of the reference camera is the first.
-        further: Trajectories in all other maps. These maps may be aligned to this map.
-    """
-
-    cameras: list[Trajectory]
-    further: list[Trajectory]
-
-
 def align_usable_cameras(
     inputs: MergeInputs,
     step: Callable[[], None],
-    options: MergeOptions | None = None,
-    excluded: Mapping[str, str] | None = None,
+    options: MergeOptions,
+    excluded: Mapping[str, str],
 ) -> UsableCameras:
     """Select the main map, and align the maps of all usable cameras to the main map.
 
@@ -67,7 +53,7 @@ def align_usable_cameras(
         inputs: Trajectories, skeleton, mounts and clocks.
         step: Function that is called after each iteration. It may raise an exception to stop the work.
         options: Options of the stage, with the known distance and the marker board of the job.
-        excluded: The result of `excluded_cameras`; None to compute it.
+        excluded: By name of a camera that must not be used, the reason.
 
     Returns:
         The usable cameras, with trajectories in the gauge of the main map.
@@ -75,10 +61,9 @@ def align_usable_cameras(
     Raises:
         EstimationError: No map contains two cameras whose distance is limited by the skeleton.
     """
-    excluded = excluded_cameras(inputs) if excluded is None else excluded
     unused: dict[str, str] = {}
-    for candidate in candidate_main_maps(inputs, excluded):
-        aligned = align_cameras(inputs, candidate.cameras, candidate.further, step, options)
+    for cameras, further in candidate_main_maps(inputs, excluded):
+        aligned = align_cameras(inputs, cameras, further, step, options)
         roles = [inputs.mount_of(each.camera).role for each in aligned.trajectories]
         if _can_determine_scale(inputs.skeleton, roles):
             return replace(aligned, unused={**excluded, **aligned.unused})
@@ -96,8 +81,8 @@ def align_usable_cameras(
 
 
 def candidate_main_maps(
-    inputs: MergeInputs, excluded: Mapping[str, str] | None = None
-) -> list[MainMapCandidate]:
+    inputs: MergeInputs, excluded: Collection[str]
+) -> list[tuple[list[Trajectory], list[Trajectory]]]:
     """Return all maps as candidates for the main map, the best candidate first.
 
     The rank of a map is the rank of its best reference camera. Cameras are ranked by their bone: first trunk,
@@ -106,14 +91,14 @@ def candidate_main_maps(
 
     Args:
         inputs: Trajectories, mounts and clocks.
-        excluded: The result of `excluded_cameras`; None to compute it.
+        excluded: Names of cameras that must not be used.
 
     Returns:
-        One candidate per map.
+        For each map, the trajectories in this map, that of the reference camera first. Then the trajectories
+        in all other maps, which may be aligned to this map.
     """
     counts = {each.camera: int(each.localised.sum()) for each in inputs.trajectories}
     seconds = {camera: count / inputs.clocks[camera].nominal_fps for camera, count in counts.items()}
-    excluded = excluded_cameras(inputs) if excluded is None else excluded
 
     def rank(trajectory: Trajectory) -> tuple[bool, int, int]:
         camera, role = trajectory.camera, inputs.mount_of(trajectory.camera).role
@@ -123,9 +108,7 @@ def candidate_main_maps(
 
     ranked = sorted((each for each in inputs.trajectories if each.camera not in excluded), key=rank)
     return [
-        MainMapCandidate(
-            [each for each in ranked if each.gauge == gauge], [each for each in ranked if each.gauge != gauge]
-        )
+        ([each for each in ranked if each.gauge == gauge], [each for each in ranked if each.gauge != gauge])
         for gauge in dict.fromkeys(each.gauge for each in ranked)
     ]
 

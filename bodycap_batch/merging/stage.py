@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -22,9 +22,8 @@ from bodycap_batch.merging.body_calibration.calibrate_body import (
 )
 from bodycap_batch.merging.body_calibration.calibration_covariance import PoseSigma
 from bodycap_batch.merging.camera_paths import trajectory_in_world, with_solved_centres
-from bodycap_batch.merging.camera_selection import select_cameras
 from bodycap_batch.merging.cameras.camera_axes import with_axes_of_cameras
-from bodycap_batch.merging.cameras.excluded_cameras import MIN_LOCALISED_FRAMES
+from bodycap_batch.merging.cameras.excluded_cameras import MIN_LOCALISED_FRAMES, excluded_cameras
 from bodycap_batch.merging.cameras.mount_slips import find_slip, without_slip
 from bodycap_batch.merging.cameras.still_parts import still_parts
 from bodycap_batch.merging.cameras.track import (
@@ -41,12 +40,7 @@ from bodycap_batch.merging.graph.foot_contact import (
     find_contacts,
     standing_joints,
 )
-from bodycap_batch.merging.graph.joint_covariance import (
-    flexion_percentiles,
-    flexion_sigma,
-    sigma_percentiles,
-    skeleton_covariance,
-)
+from bodycap_batch.merging.graph.joint_covariance import on_skeleton, sigma_percentiles
 from bodycap_batch.merging.graph.joint_distance_limits import soft_limits
 from bodycap_batch.merging.graph.motion_graph import (
     MotionGraph,
@@ -56,8 +50,10 @@ from bodycap_batch.merging.graph.motion_graph import (
     posture_deviations,
 )
 from bodycap_batch.merging.graph.windows import MAX_ITERATIONS, max_window_ticks, solve_windows
+from bodycap_batch.merging.main_map import align_usable_cameras
 from bodycap_batch.merging.projection.project import project_motion
 from bodycap_batch.merging.reporting.report import MotionFacts, build_report
+from bodycap_batch.merging.rig_priors import correlate_mount_priors
 from bodycap_batch.merging.unfit_camera import merge_without_unfit_camera
 from bodycap_batch.merging.world.floor import (
     WALKING_HEIGHT_RATIO,
@@ -71,9 +67,8 @@ from bodycap_batch.merging.world.world_frame import initial_heading, rotation_to
 from bodycap_batch.model.camera_clock import ESTIMATED_SOURCES, CameraClock
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs, MergeResult, SolvedBody
-from bodycap_batch.model.merge_report import AlignedCameraReport
 from bodycap_batch.model.scene import Trajectory
-from bodycap_batch.model.skeleton import Mount, MountSlip, SkeletonModel
+from bodycap_batch.model.skeleton import MountSlip, SkeletonModel
 
 _EXPECTED_ITERATIONS = 80
 """Expected number of optimiser iterations in the whole stage. Evidence: none.
@@ -153,7 +148,9 @@ def _solve_body(
         ImplausibleBody: The distances between the cameras fit no person.
         EstimationError: The data do not determine the motion.
     """
-    inputs, aligned = select_cameras(inputs, step, options, left_out)
+    excluded = {**excluded_cameras(inputs), **left_out}
+    inputs = correlate_mount_priors(inputs, excluded)
+    aligned = align_usable_cameras(inputs, step, options, excluded)
     used = aligned.trajectories
     bones = kinematic_chain(inputs.skeleton, {inputs.mount_of(each.camera).role for each in used})
     fps = options.fps or inputs.clocks[used[0].camera].nominal_fps
@@ -175,7 +172,10 @@ def _solve_body(
     step.what = "solving"
     scale = calibration.scale.metres_per_unit
     slips = {camera: slip.scaled(scale / prepared.provisional) for camera, slip in prepared.slips.items()}
-    solved_mounts = tuple(replace(mount, slip=slips.get(mount.camera)) for mount in calibration.mounts)
+    calibration = replace(
+        calibration,
+        mounts=tuple(replace(mount, slip=slips.get(mount.camera)) for mount in calibration.mounts),
+    )
     tracks = [within_ticks(track, tick_times) for track in tracks]
     metric = [track.scaled(scale) for track in tracks]
     rules = soft_limits(inputs.skeleton, bones, inputs.activity)
@@ -210,14 +210,17 @@ def _solve_body(
     paths = tuple(trajectory_in_world(each, world_from_map, prepared.dropped[each.camera]) for each in used)
     if options.camera_paths == "joint":
         own = {track.camera: track for track in metric}
-        by_camera = {mount.camera: mount for mount in solved_mounts}
+        by_camera = {mount.camera: mount for mount in calibration.mounts}
         paths = tuple(
             with_solved_centres(path, own[path.camera], by_camera[path.camera], solution, to_world)
             for path in paths
         )
     observed = observed_joints(inputs.skeleton, bones, tracks, tick_times, options.max_gap_s)
-    covariance = skeleton_covariance(to_world.rotation, bones, solution.uncertainty, len(placed.solved))
-    flexion_rad = flexion_sigma(bones, solution.uncertainty, len(placed.solved))
+    assert solution.uncertainty is not None
+    turned_m2 = to_world.rotation @ solution.uncertainty.centre_m2 @ to_world.rotation.T
+    covariance = on_skeleton(bones, turned_m2, len(placed.solved))
+    sigma_m = np.sqrt(np.trace(covariance, axis1=2, axis2=3) / 3.0)
+    flexion_rad = on_skeleton(bones, np.sqrt(solution.uncertainty.flexion_rad2), len(placed.solved))
     body = SolvedBody(
         skeleton=inputs.skeleton,
         fps=fps,
@@ -226,22 +229,14 @@ def _solve_body(
         solved=placed.solved,
         observed=observed,
         trajectories=paths,
-        mounts=solved_mounts,
+        mounts=calibration.mounts,
         standing=standing_joints(contacts, len(tick_times), len(placed.solved)),
     )
     step("projecting")
     projection = project_motion(body, inputs.clocks, inputs.row_fraction)
     step.finish()
     return MergeResult(
-        skeleton=body.skeleton,
-        fps=body.fps,
-        start_ns=body.start_ns,
-        graph_world_from_joint=body.graph_world_from_joint,
-        solved=body.solved,
-        observed=body.observed,
-        trajectories=body.trajectories,
-        mounts=body.mounts,
-        standing=body.standing,
+        **{item.name: getattr(body, item.name) for item in fields(body)},
         motion=projection.motion,
         projection_gap=projection.gap,
         world_from_map={gauge: world_from_map.after(main) for gauge, main in aligned.main_from_gauge.items()},
@@ -257,11 +252,12 @@ def _solve_body(
                 dropped=prepared.dropped,
                 floor=placed.floor,
                 still_ns=prepared.still_ns,
-                slips=slips,
                 unused=aligned.unused,
-                aligned={name: AlignedCameraReport(**sigmas) for name, sigmas in aligned.report().items()},
-                joint_sigma_m=sigma_percentiles(inputs.skeleton.roles, covariance, observed),
-                flexion_sigma_deg=flexion_percentiles(inputs.skeleton.roles, flexion_rad, observed),
+                aligned=aligned.sigmas,
+                joint_sigma_m=sigma_percentiles(inputs.skeleton.roles, sigma_m, observed, digits=5),
+                flexion_sigma_deg=sigma_percentiles(
+                    inputs.skeleton.roles, np.degrees(flexion_rad), observed, digits=2
+                ),
                 joint_gap_m=joint_gaps(bones, solution.world_from_bone),
                 postures=posture_deviations(
                     bones, solution.world_from_bone[_outside_t_pose(tick_times, calibration.t_pose_ns)]
@@ -375,11 +371,13 @@ def _prepare_tracks(
     mounts = inputs.mount_by_camera()
     tracks = [make_track(inputs, each, index[mounts[each.camera].role]) for each in used]
     provisional = provisional_scale(bones, tracks, mounts)
-    still_ns = {}
-    for position, still in _usable_still_parts(tracks, mounts, provisional).items():
-        times_ns = tracks[position].times_ns[still]
-        still_ns[tracks[position].camera] = int(times_ns[0]), int(times_ns[-1])
-        tracks[position] = tracks[position].keep(~still)
+    still_ns, found = {}, still_parts(tracks, mounts, provisional)
+    for position, track in enumerate(tracks):
+        still = found.get(track.camera)
+        if still is not None and int((~still).sum()) >= MIN_LOCALISED_FRAMES:
+            times_ns = track.times_ns[still]
+            still_ns[track.camera] = int(times_ns[0]), int(times_ns[-1])
+            tracks[position] = track.keep(~still)
     if still_ns:
         provisional = provisional_scale(bones, tracks, mounts)
     cleaned, dropped, slips = [], {}, {}
@@ -397,27 +395,13 @@ def _prepare_tracks(
     return _PreparedTracks(cleaned, scale, dropped, still_ns, slips)
 
 
-def _pose_sigmas(
-    aligned: Mapping[str, tuple[float, float]], slips: Mapping[str, MountSlip]
-) -> dict[str, PoseSigma]:
+def _pose_sigmas(aligned: Mapping[str, PoseSigma], slips: Mapping[str, MountSlip]) -> dict[str, PoseSigma]:
     """Return the uncertainty of the pose of a camera's map, or of a camera after a slip, by camera."""
     slipped = {camera: (slip.sigma_rad, slip.sigma_m) for camera, slip in slips.items()}
     none = (0.0, 0.0)
     return {
         camera: PoseSigma(*np.hypot(aligned.get(camera, none), slipped.get(camera, none)).tolist())
         for camera in sorted({*aligned, *slipped})
-    }
-
-
-def _usable_still_parts(
-    tracks: Sequence[CameraTrack], mounts: Mapping[str, Mount], scale: float
-) -> dict[int, BoolArray]:
-    """Return the still parts by position of the track, if enough frames remain without them."""
-    found = still_parts(tracks, mounts, scale)
-    return {
-        position: found[track.camera]
-        for position, track in enumerate(tracks)
-        if track.camera in found and int((~found[track.camera]).sum()) >= MIN_LOCALISED_FRAMES
     }
 
 
@@ -461,7 +445,8 @@ def _place_in_world(
     """
     up = calibration.vertical
     rotation = rotation_to_z_up(up.up)
-    joints, solved = complete_skeleton(skeleton, bones, _rotate_poses(rotation, solution.world_from_bone))
+    to_z_up = Similarity(1.0, rotation, np.zeros(3))
+    joints, solved = complete_skeleton(skeleton, bones, to_z_up.apply_to_poses(solution.world_from_bone))
     hips = joints[:, 0, :3, 3]
     standing = standing_height(skeleton, 0)
     path_m = solution.world_from_bone[:, 0, :3, 3]
@@ -477,7 +462,3 @@ def _place_in_world(
     )
     to_world = Similarity(1.0, world_from_solved.rotation @ rotation.T, world_from_solved.translation)
     return _PlacedBody(world_from_solved, to_world.apply_to_poses(joints), solved, floor)
-
-
-def _rotate_poses(rotation: FloatArray, poses: FloatArray) -> FloatArray:
-    return Similarity(1.0, rotation, np.zeros(3)).apply_to_poses(poses)

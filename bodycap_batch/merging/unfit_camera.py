@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
 
 from bodycap_batch.core.errors import EstimationError, ImplausibleBody
 from bodycap_batch.model.merge_data import MergeResult
@@ -16,21 +15,6 @@ _UNFIT_REASON = (
     "together with the other cameras, its positions are not possible for a person: a part of its map is "
     "probably wrong"
 )
-
-
-class _Attempt(NamedTuple):
-    """A body that was solved without one camera.
-
-    Attributes:
-        joint_error: Remaining error of the joints for each tick: half the sum of the squared residuals of the
-            joints, each divided by its sigma.
-        left_out: Name of the camera that was left out.
-        result: The solved body.
-    """
-
-    joint_error: float
-    left_out: str
-    result: MergeResult
 
 
 def merge_without_unfit_camera(
@@ -56,25 +40,16 @@ def merge_without_unfit_camera(
     try:
         return solve({})
     except ImplausibleBody:
-        attempts = _solve_without_each(cameras, solve)
-        if not attempts:
-            raise
-        return min(attempts, key=lambda attempt: attempt[:2]).result
-
-
-def _solve_without_each(
-    cameras: Sequence[str], solve: Callable[[Mapping[str, str]], MergeResult]
-) -> list[_Attempt]:
-    """Leave out each camera in turn, and return the bodies that fit."""
-    attempts = []
-    for camera in cameras:
-        try:
-            result = solve({camera: _UNFIT_REASON})
-        except EstimationError:
-            continue
-        if camera in result.unused_cameras:
+        fitting: list[tuple[float, str, MergeResult]] = []
+        for camera in cameras:
+            try:
+                result = solve({camera: _UNFIT_REASON})
+            except EstimationError:
+                continue
             solver = result.report.solver
-            error = solver.half_squared_error["joints"] / max(1, solver.ticks)
-            if error <= _MAX_JOINT_ERROR:
-                attempts.append(_Attempt(error, camera, result))
-    return attempts
+            joint_error = solver.half_squared_error["joints"] / max(1, solver.ticks)
+            if camera in result.unused_cameras and joint_error <= _MAX_JOINT_ERROR:
+                fitting.append((joint_error, camera, result))
+        if not fitting:
+            raise
+        return min(fitting, key=lambda each: each[:2])[2]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
@@ -47,6 +47,10 @@ class Footsteps:
         set_array(self, "ankle_in_world_m", (count, 3))
         set_array(self, "heading_rad", (count,))
         set_array(self, "is_sure", (count,), np.bool_)
+
+    def keep(self, mask: BoolArray) -> Footsteps:
+        """Return the periods for which `mask` (N,) is True."""
+        return Footsteps(**{item.name: getattr(self, item.name)[mask] for item in fields(self)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

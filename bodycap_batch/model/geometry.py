@@ -98,6 +98,11 @@ def so3_log(rotation: FloatArray) -> FloatArray:
     return np.asarray(vec.reshape(*rotation.shape[:-2], 3))
 
 
+def pose_vectors(pose: FloatArray) -> FloatArray:
+    """Return the rotation vectors (radians) and translations (N,6) of rigid transforms (N,4,4)."""
+    return np.hstack([so3_log(pose[:, :3, :3]), pose[:, :3, 3]])
+
+
 def so3_right_jacobian(rotvec_rad: FloatArray) -> FloatArray:
     """Return the right Jacobians (...,3,3) of rotation vectors (...,3), radians.
 
@@ -157,6 +162,19 @@ def se3_adjoint(target_from_source: FloatArray) -> FloatArray:
     return out
 
 
+def interpolate_rotation(start: FloatArray, end: FloatArray, alpha: npt.ArrayLike) -> FloatArray:
+    """Interpolate between rotations (...,3,3) by slerp.
+
+    Args:
+        start: (...,3,3) rotations at alpha 0.
+        end: (...,3,3) rotations at alpha 1.
+        alpha: Fractions of the way from `start` to `end`, 0 to 1. They are broadcast against the leading axes
+            of the rotations.
+    """
+    weight = np.asarray(alpha, dtype=np.float64)[..., None]
+    return np.asarray(start @ so3_exp(weight * so3_log(np.swapaxes(start, -1, -2) @ end)))
+
+
 def interpolate_pose(start: FloatArray, end: FloatArray, alpha: npt.ArrayLike) -> FloatArray:
     """Interpolate between rigid transforms (...,4,4): rotations by slerp, translations linearly.
 
@@ -167,8 +185,7 @@ def interpolate_pose(start: FloatArray, end: FloatArray, alpha: npt.ArrayLike) -
             of the transforms.
     """
     weight = np.asarray(alpha, dtype=np.float64)[..., None]
-    delta = so3_log(np.swapaxes(start[..., :3, :3], -1, -2) @ end[..., :3, :3])
-    rotation = start[..., :3, :3] @ so3_exp(weight * delta)
+    rotation = interpolate_rotation(start[..., :3, :3], end[..., :3, :3], alpha)
     translation = (1.0 - weight) * start[..., :3, 3] + weight * end[..., :3, 3]
     return make_transform(rotation, translation)
 

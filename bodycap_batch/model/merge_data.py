@@ -28,6 +28,12 @@ The sigma is not zero, because the shin rolls over the standing foot and moves t
 """
 _STANDING_RATE_HZ = 30.0
 """Rate, Hz, of the timeline for which `_STANDING_SPEED_M_PER_S` holds."""
+ON_TICK_TOLERANCE_NS = 1_000_000
+"""Maximum time, nanoseconds, between a measured pose and a tick at which the pose is used as it is.
+
+In a millisecond, a hand at 3 m/s moves 3 mm. In the motion graph, a pose at a larger distance gets a state of
+its own. In the projection to a rigid skeleton, it is interpolated.
+"""
 SLIP_HUBER_SIGMAS = 2.0
 """Threshold of the Huber loss for the movement of a standing foot, in sigmas.
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
-from bodycap_batch.model.geometry import invert, make_transform
+from bodycap_batch.model.geometry import interpolate_rotation, invert, make_transform
 
 _MAX_SOLE_M = 0.15
 """Maximum height, metres, of the lowest joint of the feet above or below the floor. Derivation: the ankles of
@@ -80,6 +80,10 @@ class SkeletonModel:
         while self.parents[path[-1]] >= 0:
             path.append(int(self.parents[path[-1]]))
         return path
+
+    def subtree(self, joint: int) -> list[int]:
+        """Return the index of a joint and the indices of all joints below it, parents first."""
+        return [other for other in range(joint, len(self.joints)) if joint in self.path_to_root(other)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -234,6 +238,56 @@ def forward_kinematics(
     local = make_transform(local_rotation, skeleton.offsets_m)
     local[:, 0, :3, 3] = root_in_world_m
     return _chain_poses(skeleton, local)
+
+
+def local_rotations(skeleton: SkeletonModel, world_from_joint: FloatArray) -> FloatArray:
+    """Return the rotations parent_from_joint (T,J,3,3) for world_from_joint rotations (T,J,3,3).
+
+    The rotation of the root remains unchanged.
+    """
+    out = world_from_joint.copy()
+    parent = world_from_joint[:, skeleton.parents[1:]]
+    out[:, 1:] = np.swapaxes(parent, -1, -2) @ world_from_joint[:, 1:]
+    return out
+
+
+def pose_joint(
+    skeleton: SkeletonModel, joint: int, world: FloatArray, rotation: FloatArray | None = None
+) -> None:
+    """Write the pose of a joint that follows from that of its parent.
+
+    Args:
+        skeleton: The skeleton.
+        joint: Index of the joint; not the root.
+        world: (T,J,4,4) poses in the world, metres; changed in place.
+        rotation: (T,3,3) rotations parent_from_joint; None for a joint without rotation.
+    """
+    own = make_transform(np.eye(3) if rotation is None else rotation, skeleton.offsets_m[joint])
+    world[:, joint] = world[:, skeleton.parents[joint]] @ own
+
+
+def bend_spine(
+    skeleton: SkeletonModel, joint: int, rotation: FloatArray, root: FloatArray, world: FloatArray
+) -> None:
+    """Write the poses of all joints above a joint: their orientations change evenly up to that of the root.
+
+    Joints without a role are helpers, and most of them have no length. They rotate with their parent.
+
+    Args:
+        skeleton: The skeleton.
+        joint: Index of the joint, whose pose is known.
+        rotation: (T,3,3) orientation of this joint in the world as the start of the bend.
+        root: (T,3,3) orientation of the root in the world.
+        world: (T,J,4,4) poses in the world, metres; changed in place.
+    """
+    path = skeleton.path_to_root(joint)
+    bending = [step for step in range(1, len(path)) if skeleton.roles[path[step]] or path[step] == path[-1]]
+    for step in range(1, len(path)):
+        fraction = np.full(len(world), (np.searchsorted(bending, step) + 1) / len(bending))
+        turned = interpolate_rotation(rotation, root, fraction)
+        child = path[step - 1]
+        centre = world[:, child, :3, 3] - turned @ skeleton.offsets_m[child]
+        world[:, path[step]] = make_transform(turned, centre)
 
 
 def rest_pose(skeleton: SkeletonModel) -> FloatArray:

@@ -32,6 +32,10 @@ _MEASURED_PARTS = ("ForeArm", "Hand", *LEG_PARTS)
 """Parts of limbs whose distance from the part above is the length of a long bone. These bones give the
 stature of a body."""
 
+ANKLE_OVER_LEG = 0.039 / 0.491
+"""Ratio of the ankle's height above the sole to the length of the leg. Source: R. Drillis, R. Contini, "Body
+segment parameters", 1966."""
+
 _UP, _FORWARD, _LEFT = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
 """Unit vectors of a standing body in the axes of the skeleton: z up, −y forward."""
 _NEXT_ROLE = {
@@ -172,7 +176,7 @@ def bone_vector(skeleton: SkeletonModel, role: str) -> FloatArray | None:
     if following is not None:
         vector = rest[following] - rest[joint]
         return np.asarray(vector) if np.linalg.norm(vector) > _MIN_BONE_M else None
-    subtree = [index for index in range(len(rest)) if joint in skeleton.path_to_root(index)]
+    subtree = skeleton.subtree(joint)
     tips = np.array([rest[i] + np.nan_to_num(skeleton.end_offsets_m[i]) - rest[joint] for i in subtree])
     farthest = tips[np.argmax(np.linalg.norm(tips, axis=1))]
     return np.asarray(farthest) if np.linalg.norm(farthest) > _MIN_BONE_M else None

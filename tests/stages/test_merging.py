@@ -448,8 +448,8 @@ def test_windows_of_a_long_capture_join_without_a_discontinuity(walk):
     whole, pieces = solve(1000), solve(70)
     # Three windows. Measurements 3 s away have no weight; the tolerance is that of the stopping rule.
     assert_allclose(pieces.world_from_bone[..., :3, 3], whole.world_from_bone[..., :3, 3], atol=1e-3)
-    for camera, residual in whole.residual_m.items():
-        assert_allclose(pieces.residual_m[camera], residual, atol=1e-3)
+    for camera, residuals in whole.residuals.items():
+        assert_allclose(pieces.residuals[camera].distance_m, residuals.distance_m, atol=1e-3)
     assert split_timeline(ticks, tracks, 70) == [(0, 70), (70, 140), (140, 210)]
     assert split_timeline(ticks, [tracks[0].keep(np.arange(210) < 20)], 70) == [(0, 210)]
 

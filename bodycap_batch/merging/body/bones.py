@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -151,7 +151,7 @@ def kinematic_chain(skeleton: SkeletonModel, mounted_roles: Iterable[str]) -> tu
         mounted_roles: Roles of the bones with a camera. The skeleton has a joint for each role.
     """
     joints = [skeleton.roles.index(role) for role in set(mounted_roles)]
-    chains = [joints_to_root(skeleton, joint) for joint in joints]
+    chains = [skeleton.path_to_root(joint) for joint in joints]
     top = max(set.intersection(*(set(chain) for chain in chains)))
     between = {joint for chain in chains for joint in chain if joint >= top and skeleton.roles[joint]}
     kept = sorted(between | {top})
@@ -160,16 +160,16 @@ def kinematic_chain(skeleton: SkeletonModel, mounted_roles: Iterable[str]) -> tu
     return tuple(_make_bone(skeleton, joint, order, rest) for joint in kept)
 
 
-def joints_to_root(skeleton: SkeletonModel, joint: int) -> list[int]:
-    """Return the joint and its ancestors, the joint first and the root last."""
-    chain = [joint]
-    while skeleton.parents[chain[-1]] >= 0:
-        chain.append(int(skeleton.parents[chain[-1]]))
+def bones_to_root(bones: Sequence[Bone], bone: int) -> list[int]:
+    """Return the indices of a bone and its ancestors in the graph, the bone first and the first bone last."""
+    chain = [bone]
+    while bones[chain[-1]].parent >= 0:
+        chain.append(bones[chain[-1]].parent)
     return chain
 
 
 def _make_bone(skeleton: SkeletonModel, joint: int, order: dict[int, int], rest: FloatArray) -> Bone:
-    above = next((j for j in joints_to_root(skeleton, joint)[1:] if j in order), None)
+    above = next((j for j in skeleton.path_to_root(joint)[1:] if j in order), None)
     role = skeleton.roles[joint]
     prior = _PRIORS[split_side(role)[1]] if role else _PRIORS["Spine"]
     axes = anatomical_axes(skeleton, role)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
-from bodycap_batch.merging.body.bones import Bone, joints_to_root
-from bodycap_batch.merging.cameras.track import CameraTrack
-from bodycap_batch.model.geometry import interpolate_pose, make_transform
-from bodycap_batch.model.skeleton import SkeletonModel
+from bodycap_batch.merging.body.bones import Bone
+from bodycap_batch.merging.cameras.track import CameraTrack, nearest_times
+from bodycap_batch.model.skeleton import SkeletonModel, bend_spine, pose_joint
 
 _MIN_LEVEL_AXIS = 0.3
 """Minimum horizontal length of the forward axis of a trunk that gives its heading. Unit: 1. Derivation: the
@@ -41,34 +40,15 @@ def complete_skeleton(
     for position, bone in enumerate(bones):
         out[:, bone.joint] = world_from_bone[:, position]
         solved[bone.joint] = True
+    first = bones[0].joint
+    trunk = out[:, first, :3, :3] @ bones[0].mean_rotation.T
+    bend_spine(skeleton, first, trunk, _yaw_only(trunk), out)
     posed = solved.copy()
-    _straighten_trunk_above(skeleton, bones[0], out, posed)
+    posed[skeleton.path_to_root(first)] = True
     for joint in range(count):
         if not posed[joint]:
-            parent = out[:, skeleton.parents[joint]]
-            out[:, joint] = parent @ make_transform(np.eye(3), skeleton.offsets_m[joint])
+            pose_joint(skeleton, joint, out)
     return out, solved
-
-
-def _straighten_trunk_above(skeleton: SkeletonModel, first: Bone, out: FloatArray, posed: BoolArray) -> None:
-    """Write the poses of the joints above the first bone into `out` (T,J,4,4).
-
-    The function also sets these joints to True in `posed` (J,).
-    """
-    chain = joints_to_root(skeleton, first.joint)
-    trunk = out[:, first.joint].copy()
-    trunk[:, :3, :3] = trunk[:, :3, :3] @ first.mean_rotation.T
-    pelvis = make_transform(_yaw_only(trunk[:, :3, :3]), np.zeros(3))
-    # Joints without a role are helpers, and most of them have no length. They rotate with their parent.
-    last = len(chain) - 1
-    bending = [step for step in range(1, len(chain)) if skeleton.roles[chain[step]] or step == last]
-    for step in range(1, len(chain)):
-        child, joint = chain[step - 1], chain[step]
-        fraction = np.full(len(out), (np.searchsorted(bending, step) + 1) / len(bending))
-        rotation = interpolate_pose(trunk, pelvis, fraction)[:, :3, :3]
-        centre = out[:, child, :3, 3] - rotation @ skeleton.offsets_m[child]
-        out[:, joint] = make_transform(rotation, centre)
-        posed[joint] = True
 
 
 def _yaw_only(rotation: FloatArray) -> FloatArray:
@@ -105,56 +85,16 @@ def observed_joints(
     A bone without a camera is measured if at least one bone below it and at least one other bone outside its
     subtree are measured.
     """
-    measured: dict[int, BoolArray] = {}
+    measured = np.zeros((len(bones), len(tick_times_ns)), dtype=np.bool_)
+    half_step = np.median(np.diff(tick_times_ns)) / 2 if len(tick_times_ns) > 1 else 0
     for track in tracks:
         _, valid = track.poses_at(tick_times_ns, max_gap_ns=round(max_gap_s * 1e9))
-        half_step = np.median(np.diff(tick_times_ns)) / 2 if len(tick_times_ns) > 1 else 0
-        near = np.abs(_nearest_times(track.times_ns, tick_times_ns) - tick_times_ns) <= half_step
-        own = measured.get(track.bone, np.zeros(len(tick_times_ns), dtype=bool))
-        measured[track.bone] = own | valid | near
-    below = {bone: mask.copy() for bone, mask in measured.items()}
-    never = np.zeros(len(tick_times_ns), dtype=bool)
+        near = np.abs(nearest_times(track.times_ns, tick_times_ns) - tick_times_ns) <= half_step
+        measured[track.bone] |= valid | near
+    # Number of measured bones in the subtree of each bone, which contains the bone itself.
+    inside = measured.astype(np.int64)
     for index in range(len(bones) - 1, 0, -1):
-        parent = bones[index].parent
-        below[parent] = below.get(parent, never) | below.get(index, never)
-    out = np.zeros((len(tick_times_ns), len(skeleton.joints)), dtype=bool)
-    above: Mapping[int, BoolArray] = _measured_above(bones, measured, below, never)
-    for index, bone in enumerate(bones):
-        out[:, bone.joint] = measured.get(index, never) | (above[index] & below.get(index, never))
+        inside[bones[index].parent] += inside[index]
+    out = np.zeros((len(tick_times_ns), len(skeleton.joints)), dtype=np.bool_)
+    out[:, [bone.joint for bone in bones]] = (measured | ((inside > 0) & (inside < inside[0]))).T
     return out
-
-
-def _measured_above(
-    bones: Sequence[Bone],
-    measured: Mapping[int, BoolArray],
-    below: Mapping[int, BoolArray],
-    never: BoolArray,
-) -> dict[int, BoolArray]:
-    """Return, for each bone, the ticks (T,) at which at least one bone outside its subtree is measured.
-
-    The subtree of a bone consists of the bone and all bones below it.
-
-    Args:
-        bones: The graph's bones.
-        measured: By bone, (T,) whether the bone's own cameras measure it.
-        below: By bone, (T,) whether a bone in its subtree is measured.
-        never: (T,) mask that is False at all ticks.
-    """
-    above: dict[int, BoolArray] = {0: never}
-    for index, bone in enumerate(bones[1:], start=1):
-        siblings = [
-            other for other in range(1, len(bones)) if bones[other].parent == bone.parent and other != index
-        ]
-        mask = above[bone.parent] | measured.get(bone.parent, never)
-        for other in siblings:
-            mask = mask | below.get(other, never)
-        above[index] = mask
-    return above
-
-
-def _nearest_times(sorted_ns: IntArray, times_ns: IntArray) -> IntArray:
-    """Return the nearest of the sorted times (N,) for each of `times_ns` (T,)."""
-    after = np.clip(np.searchsorted(sorted_ns, times_ns), 0, len(sorted_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    closer = np.abs(sorted_ns[before] - times_ns) <= np.abs(sorted_ns[after] - times_ns)
-    return np.asarray(np.where(closer, sorted_ns[before], sorted_ns[after]))

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray
-from bodycap_batch.merging.body.bones import LIMB_CHAINS, Bone, anatomical_axes
+from bodycap_batch.merging.body.bones import LIMB_CHAINS, Bone, anatomical_axes, bones_to_root
 from bodycap_batch.model.geometry import interpolate_pose, invert, make_transform
 from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.model.skeleton_presets import split_side
@@ -61,11 +61,9 @@ def pose_bones(
 def _first_bone_from_below(bones: Sequence[Bone], measured: Mapping[int, FloatArray]) -> FloatArray:
     """Return poses (T,4,4) of the first bone from the nearest measured bone, with joints in the rest pose."""
     nearest = min(measured)
-    pose, current = measured[nearest], nearest
-    while current > 0:
-        bone = bones[current]
-        pose = pose @ invert(make_transform(bone.mean_rotation, bone.offset_m))
-        current = bone.parent
+    pose = measured[nearest]
+    for index in bones_to_root(bones, nearest)[:-1]:
+        pose = pose @ invert(make_transform(bones[index].mean_rotation, bones[index].offset_m))
     return np.asarray(pose)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import EstimationError, ImplausibleBody
-from bodycap_batch.merging.body.bones import LIMB_CHAINS, Bone
+from bodycap_batch.merging.body.bones import LIMB_CHAINS, Bone, bones_to_root
 from bodycap_batch.merging.cameras.track import MAX_COARSE_GAP_NS, CameraTrack
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.skeleton import Mount
@@ -21,22 +21,9 @@ changes the quantile."""
 _MAX_EXTENSION = 0.96
 """Distance between the ends of a stretched limb, divided by the limb's length. The ratio is below 1, because
 the elbows of a walking person keep 15 to 30° of flexion."""
-_MIN_COMMON_FRAMES = 10
+MIN_COMMON_FRAMES = 10
 """Minimum number of frames in which two cameras are localised at the same time. With fewer such frames, the
 distance between the two cameras is not used. Evidence: none."""
-
-
-@dataclass(frozen=True, slots=True)
-class ReachConstraint:
-    """Bound on the distance of a bone's joint from a point on another bone.
-
-    Attributes:
-        anchor_m: (3,) position of the point in the other bone's frame.
-        reach_m: Maximum distance (metres) of the joint from the point.
-    """
-
-    anchor_m: FloatArray
-    reach_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,10 +121,8 @@ def kinematic_neighbours(
     by_bone = {track.bone: track for track in reversed(tracks)}
     root = next((track for track in tracks if track.bone == min(by_bone)), tracks[0])
     for track in tracks:
-        above = bones[track.bone].parent
-        while above >= 0 and above not in by_bone:
-            above = bones[above].parent
-        other = by_bone.get(above, root)
+        above = bones_to_root(bones, track.bone)[1:]
+        other = next((by_bone[bone] for bone in above if bone in by_bone), root)
         if other is not track:
             out.append((track, other))
     return out
@@ -155,24 +140,26 @@ def distance_constraint(
     constraint = reach_constraint(bones, track.bone, other.bone)
     if constraint is None:
         return None
+    anchor_m, reach_m = constraint
     poses, valid = other.poses_at(track.times_ns, max_gap_ns=MAX_COARSE_GAP_NS)
-    if valid.sum() < _MIN_COMMON_FRAMES:
+    if valid.sum() < MIN_COMMON_FRAMES:
         return None
     own_poses, other_poses = track.map_from_cam[valid], poses[valid]
     cam_from_joint = invert(mounts[track.camera].joint_from_cam)
     cam_from_other = invert(mounts[other.camera].joint_from_cam)
     tip = own_poses[:, :3, :3] @ cam_from_joint[:3, 3]
-    base = other_poses[:, :3, :3] @ (cam_from_other[:3, :3] @ constraint.anchor_m + cam_from_other[:3, 3])
-    return DistanceConstraint(own_poses[:, :3, 3] - other_poses[:, :3, 3], tip - base, constraint.reach_m)
+    base = other_poses[:, :3, :3] @ (cam_from_other[:3, :3] @ anchor_m + cam_from_other[:3, 3])
+    return DistanceConstraint(own_poses[:, :3, 3] - other_poses[:, :3, 3], tip - base, reach_m)
 
 
-def reach_constraint(bones: Sequence[Bone], bone: int, other: int) -> ReachConstraint | None:
+def reach_constraint(bones: Sequence[Bone], bone: int, other: int) -> tuple[FloatArray, float] | None:
     """Return the bound on the distance of a bone's joint from a point on another bone.
 
     Returns:
-        The bound; None if a second limb lies between the bones. The distance then depends on both limbs.
+        The position (3,) of the point in the other bone's frame, and the maximum distance (metres). None if a
+        second limb lies between the bones. The distance then depends on both limbs.
     """
-    up, down = _bones_to_root(bones, other), _bones_to_root(bones, bone)
+    up, down = bones_to_root(bones, other), bones_to_root(bones, bone)
     shared = next(index for index in down if index in up)
     above = up[: up.index(shared)]
     if above and split_side(bones[other].role)[1] == "Arm":
@@ -187,12 +174,4 @@ def reach_constraint(bones: Sequence[Bone], bone: int, other: int) -> ReachConst
             reach += float(np.linalg.norm(bones[index].offset_m))
         else:
             anchor += bones[index].offset_m
-    return ReachConstraint(anchor, reach)
-
-
-def _bones_to_root(bones: Sequence[Bone], bone: int) -> list[int]:
-    """Return the indices of the bone and its ancestors in the graph, the bone first."""
-    chain = [bone]
-    while bones[chain[-1]].parent >= 0:
-        chain.append(bones[chain[-1]].parent)
-    return chain
+    return anchor, reach

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
-from bodycap_batch.merging.body.bones import Bone, anatomical_axes
+from bodycap_batch.merging.body.bones import Bone, anatomical_axes, bones_to_root
 from bodycap_batch.merging.cameras.track import CameraTrack
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
 from bodycap_batch.model.skeleton_presets import split_side
@@ -20,14 +20,12 @@ from bodycap_batch.model.skeleton_presets import split_side
 _MODE_RADIUS_RAD = float(np.radians(15.0))
 """Maximum angle (radians) between two similar directions of a trunk. While a person walks or stands, the
 angle between the trunk and its usual direction is smaller. Evidence: none."""
-_MAX_SAMPLES, _SPHERE_DIRECTIONS = 300, 1000
-"""`_MAX_SAMPLES` is the maximum number of instants of a capture that are evaluated. `_SPHERE_DIRECTIONS` is
+MAX_SAMPLES, _SPHERE_DIRECTIONS = 300, 1000
+"""`MAX_SAMPLES` is the maximum number of instants of a capture that are evaluated. `_SPHERE_DIRECTIONS` is
 the number of directions on the sphere that are evaluated. Both numbers limit the computing time."""
 _UPRIGHT_SIGMA_DEG = 12.0
-"""Sigma (degrees) of the forward tilt of the trunk while the person stands or walks. This sigma contains 5
-degrees of systematic bias. The rest is the error of the camera's mount. Evidence: none."""
-_LATERAL_SIGMA_DEG = 12.0
-"""Sigma (degrees) of the sideways tilt of the trunk."""
+"""Sigma (degrees) of the tilt of the trunk while the person stands or walks, forward and sideways. This sigma
+contains 5 degrees of systematic bias. The rest is the error of the camera's mount. Evidence: none."""
 _UPRIGHT_SHARE, _FORWARD_SHARE, _BACKWARD_SHARE, _OUTLIER_SHARE = 0.57, 0.35, 0.07, 0.01
 """Assumed fractions of the time. In this order, they are for a trunk that is upright, a trunk that bends
 forward, a trunk that reclines, and all other orientations. Evidence: none."""
@@ -125,7 +123,7 @@ def _pitch_nll(pitch_deg: FloatArray, outlier_share: float) -> FloatArray:
 
 def _lateral_nll(side_deg: FloatArray, outlier_share: float) -> FloatArray:
     """Return the negative log-likelihood of sideways tilts in degrees, minus the value for no tilt."""
-    density = (1.0 - outlier_share) * np.exp(-0.5 * (side_deg / _LATERAL_SIGMA_DEG) ** 2) + outlier_share
+    density = (1.0 - outlier_share) * np.exp(-0.5 * (side_deg / _UPRIGHT_SIGMA_DEG) ** 2) + outlier_share
     return np.asarray(-np.log(density))
 
 
@@ -163,10 +161,8 @@ def trunk_orientation_from_prior(bones: Sequence[Bone], trunk: CameraTrack, moun
     The joints between the camera's bone and the first bone are assumed to be in the rest pose.
     """
     rest = np.eye(3)
-    index = trunk.bone
-    while bones[index].parent >= 0:
+    for index in bones_to_root(bones, trunk.bone)[:-1]:
         rest = bones[index].mean_rotation.T @ rest
-        index = bones[index].parent
     joint = trunk.map_from_cam[:, :3, :3] @ mount.joint_from_cam[:3, :3].T
     return TrunkOrientation(joint @ rest)
 
@@ -185,7 +181,7 @@ def modal_direction(directions: FloatArray) -> FloatArray:
 
 def _subsample(items: FloatArray) -> FloatArray:
     """Return up to 300 evenly spaced items (N,...). The indices of the items are rounded down."""
-    return np.asarray(items[np.unique(np.linspace(0, len(items) - 1, _MAX_SAMPLES).astype(np.int64))])
+    return np.asarray(items[np.unique(np.linspace(0, len(items) - 1, MAX_SAMPLES).astype(np.int64))])
 
 
 def _orthogonal_axes(left: FloatArray, up: FloatArray) -> FloatArray:

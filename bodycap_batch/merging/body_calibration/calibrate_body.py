@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
-from bodycap_batch.config.options import MarkerBoard, MergeOptions
+from bodycap_batch.config.options import MergeOptions
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.bones import Bone
 from bodycap_batch.merging.body.t_pose import arm_span, find_t_pose
 from bodycap_batch.merging.body.trunk_lean import trunk_orientation, trunk_orientation_from_prior
 from bodycap_batch.merging.body_calibration.calibration_covariance import (
     PoseSigma,
-    ScaleUncertainty,
     error_modes,
     mounts_with_sigmas,
 )
@@ -25,8 +23,6 @@ from bodycap_batch.merging.body_calibration.camera_roll import (
     search_rolls,
     with_roll,
 )
-from bodycap_batch.merging.body_calibration.known_distance import known_distance
-from bodycap_batch.merging.body_calibration.marker_board import LocatedBoard, locate_board
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import PostureHints, take_samples
 from bodycap_batch.merging.body_calibration.scale import (
@@ -37,12 +33,11 @@ from bodycap_batch.merging.body_calibration.scale import (
     scale_from_bones,
     scale_from_floor,
 )
-from bodycap_batch.merging.body_calibration.skeleton_error_modes import skeleton_error_modes
+from bodycap_batch.merging.body_calibration.stated_constraints import stated_constraints
 from bodycap_batch.merging.cameras.track import CameraTrack
-from bodycap_batch.merging.graph.error_modes import ErrorModes
+from bodycap_batch.merging.graph.error_modes import ErrorModes, stack_modes
 from bodycap_batch.merging.graph.posture import is_mostly_walking
 from bodycap_batch.merging.world.floor import WALKING_HEIGHT_RATIO, floor_beside_path, standing_height
-from bodycap_batch.merging.world.measured_gravity import verticals_from_accelerometers
 from bodycap_batch.merging.world.vertical import SceneContext, Vertical, VerticalHypothesis, estimate_vertical
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs
@@ -73,13 +68,12 @@ class CalibrationInput:
         alignment: Uncertainty of the pose of each camera's map in the main map. The key is the camera's
             name. It contains only cameras whose map was aligned to the main map.
         main_from_gauge: Similarity from each used map to the main map. The key is the gauge of the used map.
-            None if all cameras are in one map.
     """
 
     tracks: Sequence[CameraTrack]
     provisional: float
-    alignment: Mapping[str, PoseSigma] = field(default_factory=dict)
-    main_from_gauge: Mapping[str, Similarity] | None = None
+    alignment: Mapping[str, PoseSigma]
+    main_from_gauge: Mapping[str, Similarity]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,19 +110,6 @@ class BodyCalibration:
     off_hinge_m: Mapping[str, float] = field(default_factory=dict)
 
 
-class ReferenceCameraRoll(NamedTuple):
-    """The roll of the reference camera, and the vertical.
-
-    Attributes:
-        roll_deg: Roll about the optical axis, degrees.
-        vertical: The vertical in the gauge of the tracks' map. None if neither the job nor the map nor the
-            walk determines the vertical, or if the reference camera is on a limb.
-    """
-
-    roll_deg: float
-    vertical: Vertical | None
-
-
 def calibrate_body(
     inputs: MergeInputs,
     options: MergeOptions,
@@ -157,14 +138,8 @@ def calibrate_body(
     """
     tracks, provisional = data.tracks, data.provisional
     t_pose_ns = _t_pose_interval(inputs.skeleton, options.t_pose_s, bones, data)
-    board = locate_board(inputs.trajectories, inputs.board_views, options.marker_board, data.main_from_gauge)
-    main = next(each.gauge for each in inputs.trajectories if each.camera == tracks[0].camera)
-    gauges = data.main_from_gauge or {main: Similarity(1.0, np.eye(3), np.zeros(3))}
-    verticals = (
-        *stated_verticals(options.marker_board, board),
-        *verticals_from_accelerometers(inputs, gauges),
-    )
-    inputs, hints, rolls = _resolve_camera_rolls(inputs, bones, data, t_pose_ns, verticals, step)
+    stated = stated_constraints(inputs, options, data.main_from_gauge)
+    inputs, hints, rolls = _resolve_camera_rolls(inputs, bones, data, t_pose_ns, stated.verticals, step)
     priors = inputs.mount_by_camera()
     samples = take_samples(tracks, provisional, _SAMPLES, hints.vertical, t_pose_ns)
     graph = CalibrationGraph(inputs.skeleton, bones, samples, priors, provisional, step)
@@ -181,14 +156,12 @@ def calibrate_body(
         walks=not split_side(bones[0].role)[0] and is_mostly_walking(tracks[0].scaled(estimate.scale)),
     )
     up = estimate_vertical(
-        trunk_orientation(inputs.skeleton, bones, poses), scene, np.random.default_rng(0), verticals
+        trunk_orientation(inputs.skeleton, bones, poses), scene, np.random.default_rng(0), stated.verticals
     )
     walking = graph.samples.posture.walking
     # A person who bends or sits lowers the trunk. Only walking gives the trunk's height over the floor.
     upright = poses[walking] if walking.sum() >= MIN_WALKING_SAMPLES else poses
     height_m = _height_over_floor(bones[0], upright, up, scene)
-    distance = known_distance(inputs.trajectories, options.known_distance, data.main_from_gauge)
-    stated = (distance, None if board is None else board.scale)
     bones_alone = scale_from_bones(
         estimate,
         is_measured=inputs.skeleton_is_measured,
@@ -197,37 +170,30 @@ def calibrate_body(
     scale = combine_sources(
         bones_alone,
         None if height_m is None else scale_from_floor(bones_alone, height_m, scene.standing_m),
-        [source for source in stated if source is not None],
+        stated.scales,
     )
     if scale.metres_per_unit != estimate.scale:
         graph.solve(scale.metres_per_unit)
     stature_m = MEAN_HEIGHT_M if inputs.height_m is None else inputs.height_m
-    modes = error_modes(
+    constant, transient = error_modes(
         graph,
-        ScaleUncertainty(scale.sigma_log, estimate.mount_slope),
+        scale.sigma_log,
+        estimate.mount_slope,
         data.alignment,
-        None if inputs.skeleton_is_measured else skeleton_error_modes(bones, samples.cameras, stature_m),
+        None if inputs.skeleton_is_measured else stature_m,
     )
     return BodyCalibration(
         scale=scale,
         bones_alone=estimate,
-        mounts=mounts_with_sigmas(graph, modes.constant),
+        mounts=mounts_with_sigmas(graph, constant),
         reference_prior=priors[tracks[0].camera],
-        error_modes=modes.stacked(),
+        error_modes=stack_modes([constant, transient]),
         vertical=up,
         height_over_floor_m=height_m,
         t_pose_ns=t_pose_ns,
         rolls=rolls,
         off_hinge_m=graph.hinge_violation_m(),
     )
-
-
-class _ResolvedRolls(NamedTuple):
-    """The result of the roll searches: inputs with rotated mount priors, posture hints, and the searches."""
-
-    inputs: MergeInputs
-    hints: PostureHints
-    searches: tuple[RollSearch, ...]
 
 
 def _resolve_camera_rolls(
@@ -237,17 +203,20 @@ def _resolve_camera_rolls(
     t_pose_ns: tuple[int, int] | None,
     stated: Sequence[VerticalHypothesis],
     step: Callable[[], None],
-) -> _ResolvedRolls:
-    """Find the roll of the reference camera, then the rolls of the other cameras."""
+) -> tuple[MergeInputs, PostureHints, tuple[RollSearch, ...]]:
+    """Find the roll of the reference camera, then the rolls of the other cameras.
+
+    Returns:
+        The inputs with rotated mount priors, the facts about the posture, and the searches.
+    """
     roll_deg, found = reference_camera_roll(inputs, bones, data.tracks, data.provisional, stated)
     hints = PostureHints(vertical=None if found is None else found.up, t_pose_ns=t_pose_ns)
     inputs = with_rolls(inputs, {data.tracks[0].camera: roll_deg})
     searches = search_rolls(
         inputs.skeleton, inputs.mount_by_camera(), data.tracks, data.provisional, hints, step
     )
-    return _ResolvedRolls(
-        with_rolls(inputs, {search.camera: search.chosen_deg for search in searches}), hints, searches
-    )
+    inputs = with_rolls(inputs, {search.camera: search.chosen_deg for search in searches})
+    return inputs, hints, searches
 
 
 def reference_camera_roll(
@@ -256,7 +225,7 @@ def reference_camera_roll(
     tracks: Sequence[CameraTrack],
     provisional: float,
     stated: Sequence[VerticalHypothesis],
-) -> ReferenceCameraRoll:
+) -> tuple[float, Vertical | None]:
     """Find the roll of the reference camera, and the vertical if the job, the map or the walk gives it.
 
     Args:
@@ -267,7 +236,9 @@ def reference_camera_roll(
         stated: Possible verticals from the marker board that the job describes, and from accelerometers.
 
     Returns:
-        The roll and the vertical.
+        The roll about the optical axis, degrees, and the vertical in the gauge of the tracks' map. The
+        vertical is None if neither the job nor the map nor the walk determines it, or if the reference
+        camera is on a limb.
     """
     reference = tracks[0].scaled(provisional)
     points_m = provisional * map_points_of(inputs, reference.camera)
@@ -288,8 +259,8 @@ def reference_camera_roll(
             return None
         return trunk_orientation_from_prior(bones, reference, with_roll(prior, roll_deg)).upright_up()
 
-    roll_deg = reference_roll(inputs.mount_by_camera(), tracks, vertical_of, trunk_up_of).roll_deg
-    return ReferenceCameraRoll(roll_deg, found.get(roll_deg))
+    roll_deg = reference_roll(inputs.mount_by_camera(), tracks, vertical_of, trunk_up_of)
+    return roll_deg, found.get(roll_deg)
 
 
 def preliminary_vertical(
@@ -326,19 +297,6 @@ def preliminary_vertical(
         trunk_orientation_from_prior(bones, reference, mount), scene, np.random.default_rng(0), stated
     )
     return None if found.source == "body" or not found.is_determined() else found
-
-
-def stated_verticals(asked: MarkerBoard | None, board: LocatedBoard | None) -> tuple[VerticalHypothesis, ...]:
-    """Return the possible verticals that follow from the marker board of the job.
-
-    Args:
-        asked: The marker board that the job describes; None if the job describes none.
-        board: The marker board as located in the map; None if the job describes none.
-
-    Returns:
-        The possible verticals. Empty without a board, or if the job does not say how the board is placed.
-    """
-    return () if board is None or asked is None else board.verticals(asked.placed)
 
 
 def with_rolls(inputs: MergeInputs, rolls_deg: Mapping[str, float]) -> MergeInputs:

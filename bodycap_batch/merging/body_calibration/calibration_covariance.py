@@ -6,7 +6,6 @@ Also compute the derivatives of the graph's residuals with respect to camera pos
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,10 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.mount_covariance import TRANSIENT_SHARE, LinearisedCalibration
-from bodycap_batch.merging.body_calibration.skeleton_error_modes import SkeletonErrorModes
+from bodycap_batch.merging.body_calibration.skeleton_error_modes import (
+    bone_length_modes,
+    joint_placement_modes,
+)
 from bodycap_batch.merging.graph.error_modes import (
     POSTURE_BIAS_SHARE,
     ErrorModes,
@@ -41,64 +43,36 @@ class PoseSigma(NamedTuple):
     position_m: float
 
 
-@dataclass(frozen=True, slots=True)
-class ScaleUncertainty:
-    """Uncertainty of the metric scale, and how the mounts depend on the scale.
-
-    Attributes:
-        sigma_log: Sigma of the logarithm of the scale.
-        mount_slope: By camera, change of joint_from_cam (4,4) per unit of log scale.
-    """
-
-    sigma_log: float
-    mount_slope: Mapping[str, FloatArray]
-
-
-@dataclass(frozen=True, slots=True)
-class CalibrationErrorModes:
-    """The error modes of a calibration, from which the uncertainty of the solved motion follows.
-
-    Attributes:
-        constant: Modes that are constant over the capture: noise of the calibration, bias of the posture,
-            scale, bone lengths.
-        transient: Modes that each act on one interval of the motion only: bends of the map, varying posture,
-            placement of the joints.
-    """
-
-    constant: ErrorModes
-    transient: ErrorModes
-
-    def stacked(self) -> ErrorModes:
-        """Return the constant modes, then the transient modes."""
-        return stack_modes([self.constant, self.transient])
-
-
 def error_modes(
     graph: CalibrationGraph,
-    scale: ScaleUncertainty,
+    sigma_log: float,
+    mount_slope: Mapping[str, FloatArray],
     alignment: Mapping[str, PoseSigma],
-    skeleton: SkeletonErrorModes | None = None,
-) -> CalibrationErrorModes:
+    stature_m: float | None = None,
+) -> tuple[ErrorModes, ErrorModes]:
     """Return the error modes of the last solution of a calibration graph.
 
     Args:
         graph: The solved calibration graph.
-        scale: Uncertainty of the scale.
+        sigma_log: Sigma of the logarithm of the scale.
+        mount_slope: By camera, change of joint_from_cam (4,4) per unit of log scale.
         alignment: By camera, uncertainty of the pose of this camera's map. It contains only cameras whose map
             was aligned to the main map through the body.
-        skeleton: Error modes of the bones; None if the bones were measured. The modes of joint placement are
-            transient. They do not increase the uncertainty of the mounts, because the mounts refer to the
-            same placement of the joints.
+        stature_m: Stature from which the bones were scaled, metres; None if the bones were measured. The
+            modes of joint placement are transient. They do not increase the uncertainty of the mounts,
+            because the mounts refer to the same placement of the joints.
 
     Returns:
-        The constant and the transient modes.
+        The modes that are constant over the capture: noise of the calibration, bias of the posture, scale,
+        bone lengths. Then the modes that each act on one interval of the motion only: bends of the map,
+        varying posture, placement of the joints.
     """
     samples, cameras = graph.samples, graph.samples.cameras
     linearised = graph.linearised()
     reduced = linearised.reduced()
     body_modes = [posture_bias_modes(linearised.body.bones, cameras, POSTURE_BIAS_SHARE)]
-    body_modes += [] if skeleton is None else [skeleton.bone_lengths]
-    follow = {name: mount_perturbation(graph.mounts[name], scale.mount_slope[name]) for name in cameras}
+    body_modes += [] if stature_m is None else [bone_length_modes(graph.bones, cameras)]
+    follow = {name: mount_perturbation(graph.mounts[name], mount_slope[name]) for name in cameras}
     # The sigmas of the samples contain the map's error, multiplied by the number of samples that share it.
     map_error = (1.0 - samples.white_noise_share) / samples.correlated_samples
     bends = np.sqrt(map_error) * np.stack([samples.sigma_rad, graph.scale * samples.sigma_map], axis=1)
@@ -106,15 +80,17 @@ def error_modes(
     constant = stack_modes(
         [
             linearised.error_modes(reduced, stack_modes(body_modes)),
-            scale_modes(graph.bones, scale.sigma_log, follow),
+            scale_modes(graph.bones, sigma_log, follow),
         ]
     )
     transient = [
         posture_bias_modes(graph.bones, cameras, TRANSIENT_SHARE),
         map_error_modes(graph.bones, dict(zip(cameras, bends, strict=True))),
     ]
-    transient += [] if skeleton is None else [linearised.propagated(reduced, skeleton.joint_placement)]
-    return CalibrationErrorModes(constant, stack_modes(transient))
+    if stature_m is not None:
+        placement = joint_placement_modes(graph.bones, cameras, stature_m)
+        transient.append(linearised.propagated(reduced, placement))
+    return constant, stack_modes(transient)
 
 
 def mounts_with_sigmas(graph: CalibrationGraph, modes: ErrorModes) -> tuple[Mount, ...]:

@@ -7,18 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
-from bodycap_batch.merging.body_calibration.samples import (
-    MIN_COMMON_FRAMES,
-    PostureHints,
-    count_common_frames,
-    sample_subset,
-)
+from bodycap_batch.merging.body_calibration.samples import PostureHints, take_samples
 from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
@@ -58,36 +53,13 @@ _PARTS_BELOW = {
 Working hands are above the belt, so a camera on the hips or the lower spine has only the legs below it.
 Shoulders are always above a camera on the chest.
 """
+_MIN_COMMON_FRAMES = 15
+"""Minimum number of common frames of a camera and the reference camera: half a second at 30 fps. The search
+skips a camera with fewer. Evidence: none."""
 _SAMPLES = 30
 """Maximum number of sampled times in the calibration of one roll. Evidence: none."""
 _ITERATIONS = 12
 """Maximum number of optimiser iterations in the calibration of one roll. Evidence: none."""
-
-
-class RollCost(NamedTuple):
-    """A roll, and its cost relative to the selected roll.
-
-    Attributes:
-        roll_deg: Roll about the optical axis, degrees.
-        extra_cost: Cost of this roll minus the cost of the selected roll. The cost is half the sum of the
-            squared residuals.
-    """
-
-    roll_deg: float
-    extra_cost: float
-
-
-class ReferenceRoll(NamedTuple):
-    """The roll of the reference camera, and the vertical.
-
-    Attributes:
-        roll_deg: Roll about the optical axis, degrees.
-        vertical: (3,) the vertical that the job, the map or the walk gives for this roll. None if none of
-            these sources gives a vertical.
-    """
-
-    roll_deg: float
-    vertical: FloatArray | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,12 +79,12 @@ class RollSearch:
     costs: tuple[float, ...]
     chosen_deg: float
 
-    def runner_up(self) -> RollCost:
-        """Return the roll with the lowest cost among the rolls that were not selected."""
+    def runner_up(self) -> tuple[float, float]:
+        """Return the best of the other rolls (degrees), and its cost minus that of the selected roll."""
         chosen = self.costs[ROLLS_DEG.index(self.chosen_deg)]
         rest = [(cost - chosen, roll) for roll, cost in zip(ROLLS_DEG, self.costs, strict=True)]
         cost, roll = min(pair for pair in rest if pair[1] != self.chosen_deg)
-        return RollCost(roll, cost)
+        return roll, cost
 
 
 def with_roll(mount: Mount, degrees: float) -> Mount:
@@ -167,14 +139,17 @@ def search_rolls(
         mount = mounts[track.camera]
         if not has_unknown_roll(mount) or mount.role == mounts[reference.camera].role:
             continue
-        if count_common_frames(reference, track) < MIN_COMMON_FRAMES:
+        if track.poses_at(reference.times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)[1].sum() < _MIN_COMMON_FRAMES:
             continue
-        pair = {camera: mounts[camera] for camera in (reference.camera, track.camera)}
-        subset = sample_subset(skeleton, pair, (reference, track), scale, _SAMPLES, hints)
+        roles = [mounts[each.camera].role for each in (reference, track)]
+        bones = kinematic_chain(skeleton, roles)
+        index = {bone.role: number for number, bone in enumerate(bones)}
+        pair = [replace(each, bone=index[role]) for each, role in zip((reference, track), roles, strict=True)]
+        samples = take_samples(pair, scale, _SAMPLES, hints.vertical, hints.t_pose_ns)
         costs = []
         for roll in ROLLS_DEG:
-            priors = {**pair, track.camera: with_roll(mount, roll)}
-            graph = CalibrationGraph(skeleton, subset.bones, subset.samples, priors, scale, step)
+            priors = {**mounts, track.camera: with_roll(mount, roll)}
+            graph = CalibrationGraph(skeleton, bones, samples, priors, scale, step)
             costs.append(graph.solve(scale, iterations=_ITERATIONS))
         out.append(_select_roll(track.camera, np.array(costs)))
     return tuple(out)
@@ -201,7 +176,7 @@ def reference_roll(
     tracks: Sequence[CameraTrack],
     vertical_of: Callable[[float], FloatArray | None],
     trunk_up_of: Callable[[float], FloatArray | None] = lambda _: None,
-) -> ReferenceRoll:
+) -> float:
     """Find the roll of the reference camera from the limbs that hang below it most of the time.
 
     Args:
@@ -211,29 +186,26 @@ def reference_roll(
             comes from the job, the map or the walk. If several directions are possible, the function selects
             the direction that best fits the up direction of the camera with this roll.
         trunk_up_of: Function that takes a roll in degrees and returns the up direction of the trunk (3,) or
-            None. This direction is used only if `vertical_of` returns None for all rolls. It is never
-            returned as the vertical.
+            None. This direction is used only if `vertical_of` returns None for all rolls.
 
     Returns:
-        The roll and the vertical. The roll is 0 if the job gives the orientation of the reference camera, if
+        The roll, degrees. It is 0 if the job gives the orientation of the reference camera, if
         no limbs hang below the camera, or if no other roll is clearly better.
     """
     reference, limbs, usual = tracks[0], hanging_tracks(mounts, tracks), vertical_of(0.0)
     usual_cosine = 0.0 if usual is None else mean_down_cosine(reference, limbs, usual)
     is_decided = usual_cosine > _MIN_DOWN_COSINE
     if not has_unknown_roll(mounts[reference.camera]) or not limbs or is_decided:
-        return ReferenceRoll(0.0, usual)
-    found = [
-        (mean_down_cosine(reference, limbs, up), roll, up)
+        return 0.0
+    cosines = {
+        roll: mean_down_cosine(reference, limbs, up)
         for roll in ROLLS_DEG[1:]
         if (up := vertical_of(roll)) is not None
-    ]
-    if usual is None and not found:
-        return ReferenceRoll(_roll_from_trunk(reference, limbs, trunk_up_of), None)
-    cosine, roll, vertical = max(found, key=lambda each: each[0], default=(0.0, 0.0, usual))
-    if cosine > usual_cosine + _MIN_COSINE_GAIN:
-        return ReferenceRoll(roll, vertical)
-    return ReferenceRoll(0.0, usual)
+    }
+    if usual is None and not cosines:
+        return _roll_from_trunk(reference, limbs, trunk_up_of)
+    best = max(cosines, key=lambda roll: cosines[roll], default=0.0)
+    return best if cosines.get(best, 0.0) > usual_cosine + _MIN_COSINE_GAIN else 0.0
 
 
 def mean_down_cosine(reference: CameraTrack, limbs: Sequence[CameraTrack], vertical: FloatArray) -> float:

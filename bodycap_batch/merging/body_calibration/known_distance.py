@@ -34,7 +34,7 @@ The sigma is the uncertainty of the difference of the two centres, per axis.
 def known_distance(
     trajectories: Sequence[Trajectory],
     stated: tuple[str, str, float] | None,
-    main_from_gauge: Mapping[str, Similarity] | None = None,
+    main_from_gauge: Mapping[str, Similarity],
 ) -> ScaleSource | None:
     """Return the scale from the known distance of the job.
 
@@ -42,8 +42,7 @@ def known_distance(
         trajectories: The cameras' trajectories, each in the gauge of its map.
         stated: Two frames as ``camera:frame``, and the distance between their camera centres in metres. None
             if the job gives no distance.
-        main_from_gauge: By gauge of each used map, similarity from this map to the main map. None if all
-            cameras are in one map.
+        main_from_gauge: By gauge of each used map, similarity from this map to the main map.
 
     Returns:
         The scale of the main map; None if the job gives no distance.
@@ -64,12 +63,11 @@ def known_distance(
             field=_FIELD,
             hint="choose two frames of one camera",
         )
-    if main_from_gauge is not None and gauge not in main_from_gauge:
+    if gauge not in main_from_gauge:
         raise EstimationError(
             f"the frames {first} and {second} are in map {gauge}, which was not aligned with the main map",
             hint="choose two frames of a camera that is used; metrics.json lists the unused cameras",
         )
-    unit = 1.0 if main_from_gauge is None else main_from_gauge[gauge].scale
     variance = sum(end.centre_variance for end in ends)
     distance = float(np.linalg.norm(ends[1].centre - ends[0].centre))
     if distance**2 <= _MIN_SIGNAL_TO_NOISE**2 * variance:
@@ -79,7 +77,11 @@ def known_distance(
             hint="choose two frames in which the camera positions are farther apart",
         )
     sigma = np.sqrt(variance / distance**2 + 2.0 * (MIN_SIGMA_M / metres) ** 2 + _MIN_SIGMA**2)
-    return ScaleSource(name="known distance", scale=metres / (unit * distance), sigma_log=float(sigma))
+    return ScaleSource(
+        name="known distance",
+        scale=metres / (main_from_gauge[gauge].scale * distance),
+        sigma_log=float(sigma),
+    )
 
 
 class _End(NamedTuple):

@@ -106,7 +106,7 @@ def locate_board(
     trajectories: Sequence[Trajectory],
     views: Sequence[BoardView],
     board: MarkerBoard | None,
-    main_from_gauge: Mapping[str, Similarity] | None = None,
+    main_from_gauge: Mapping[str, Similarity],
 ) -> LocatedBoard | None:
     """Locate the marker board of the job in the map.
 
@@ -123,7 +123,7 @@ def locate_board(
         views: The views of the board.
         board: The board that the job describes; None if the job describes none.
         main_from_gauge: By gauge of each used map, similarity from this map to the main map. The main map is
-            the first. None if all cameras are in one map.
+            the first.
 
     Returns:
         The board in the map; None if the job describes no board.
@@ -150,20 +150,18 @@ def locate_board(
             hint="walk past the board, so that the cameras see the board from several sides; or leave out "
             "merge.marker_board",
         )
-    unit, turn = 1.0, np.eye(3)
-    if main_from_gauge is not None:
-        unit, turn = main_from_gauge[gauge].scale, main_from_gauge[gauge].rotation
+    to_main = main_from_gauge[gauge]
     axes = so3_exp(found[None, :3])[0]
     # Detectors disagree on the sign of the normal. The cameras always see the front of a board.
     axes[:, 2] *= np.sign((seen.map_from_cam[:, :3, 3] - found[3:6]).mean(axis=0) @ axes[:, 2])
-    scale = ScaleSource(name=SOURCE_NAME, scale=float(np.exp(-found[6])) / unit, sigma_log=sigma)
-    return LocatedBoard(scale, turn @ axes)
+    scale = ScaleSource(name=SOURCE_NAME, scale=float(np.exp(-found[6])) / to_main.scale, sigma_log=sigma)
+    return LocatedBoard(scale, to_main.rotation @ axes)
 
 
 def _select_observations(
     trajectories: Sequence[Trajectory],
     views: Sequence[BoardView],
-    main_from_gauge: Mapping[str, Similarity] | None,
+    main_from_gauge: Mapping[str, Similarity],
     *,
     has_half_turns: bool,
 ) -> tuple[str, _BoardObservations]:
@@ -178,10 +176,10 @@ def _select_observations(
     by_gauge: dict[str, list[BoardView]] = {}
     for view in views:
         path = paths[view.camera]
-        if path.localised[view.frame] and (main_from_gauge is None or path.gauge in main_from_gauge):
+        if path.localised[view.frame] and path.gauge in main_from_gauge:
             by_gauge.setdefault(path.gauge, []).append(view)
     gauge, selected = max(by_gauge.items(), key=lambda item: len(item[1]), default=("", []))
-    main = next(iter(main_from_gauge or {}), gauge)
+    main = next(iter(main_from_gauge))
     if len(by_gauge.get(main, [])) >= _MIN_VIEWS:
         gauge, selected = main, by_gauge[main]  # the scale of an aligned map is less certain
     if len(selected) < _MIN_VIEWS:

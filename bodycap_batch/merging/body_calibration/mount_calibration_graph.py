@@ -27,6 +27,7 @@ from bodycap_batch.merging.body_calibration.samples import CalibrationSamples
 from bodycap_batch.merging.graph.attitude_factors import AttitudeFactors
 from bodycap_batch.merging.graph.error_modes import BodyModel
 from bodycap_batch.merging.graph.factors import (
+    POINTS_PER_MOUNT,
     JointFactors,
     add_mount_measurements,
     add_mount_prior,
@@ -35,6 +36,7 @@ from bodycap_batch.merging.graph.factors import (
     mount_from_points,
     mount_jacobian,
     mount_keys,
+    poses_from_values,
     values_from_poses,
 )
 from bodycap_batch.merging.graph.joint_priors import samples_per_gesture, widen_joint_priors
@@ -42,12 +44,6 @@ from bodycap_batch.merging.graph.linearisation import linearise
 from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 from bodycap_batch.model.geometry import invert
 from bodycap_batch.model.skeleton import Mount, SkeletonModel
-
-POINTS_PER_MOUNT = 4
-"""Number of points that represent a mount.
-
-Each measured camera pose and each mount prior adds one factor per point to the graph.
-"""
 
 
 class CalibrationGraph:
@@ -58,6 +54,11 @@ class CalibrationGraph:
     makes all residuals small.
 
     Attributes:
+        bones: Original bones, before `widen_joint_priors` and `test_hinges` changed their priors.
+        samples: Camera poses at the sampled ticks. If other poses of the same cameras at the same ticks
+            replace them, the next solution starts from the last solution.
+        priors: By camera, its mount prior.
+        scale: Scale of the last solution, metres per map unit.
         slack_factor: Factor on the sigma of the joint gaps.
         mounts: By camera, joint_from_cam (4,4) of the last solution.
 
@@ -81,52 +82,24 @@ class CalibrationGraph:
         provisional: float,
         step: Callable[[], None],
     ) -> None:
-        self._skeleton, self._bones, self._samples = skeleton, tuple(bones), samples
+        self._skeleton, self.bones, self.samples = skeleton, tuple(bones), samples
         self._rest_bones, self._t_pose_bones = tuple(bones), with_t_pose_prior(skeleton, bones)
         self._hinges = hinges(skeleton, tuple(bones))
-        self._priors, self._step = priors, step
+        self.priors, self._step = priors, step
         self._slack_map = JOINT_SLACK_M * np.sqrt(samples.correlated_samples) / provisional
         self._values: Any = None
-        self._scale, self._first_joint_factor = 1.0, 0
+        self.scale, self._first_joint_factor = 1.0, 0
         self.slack_factor = 1.0
         self.mounts = {name: np.array(priors[name].joint_from_cam) for name in samples.cameras}
-
-    @property
-    def samples(self) -> CalibrationSamples:
-        """Camera poses at the sampled ticks, as the graph uses them."""
-        return self._samples
-
-    @property
-    def bones(self) -> tuple[Bone, ...]:
-        """Original bones of the graph, before `widen_joint_priors` and `test_hinges` changed their priors."""
-        return self._bones
-
-    @property
-    def priors(self) -> Mapping[str, Mount]:
-        """Mount prior of each camera, by camera name."""
-        return self._priors
-
-    @property
-    def scale(self) -> float:
-        """Scale of the last solution, metres per map unit."""
-        return self._scale
-
-    def set_samples(self, samples: CalibrationSamples) -> None:
-        """Replace the camera poses. The next solution starts from the last solution.
-
-        Args:
-            samples: Other poses of the same cameras at the same ticks.
-        """
-        self._samples = samples
 
     def leave_out_map_errors(self) -> None:
         """Reduce the sigmas of the camera poses and of the joint gaps to those of one sample alone.
 
         What samples share as an error of the map does not move one map against another one.
         """
-        samples = self._samples
+        samples = self.samples
         share = samples.white_noise_share
-        self._samples = replace(
+        self.samples = replace(
             samples,
             sigma_rad=np.sqrt(share) * samples.sigma_rad,
             sigma_map=np.sqrt(share) * samples.sigma_map,
@@ -145,23 +118,23 @@ class CalibrationGraph:
             The cost: half the sum of the squared, robustly weighted residuals.
         """
         poses = self._metric_poses(scale)
-        points = self._samples.mount_points(scale)
+        points = self.samples.mount_points(scale)
         graph = self._graph(poses, scale)
         start = self._initial_values(poses, scale)
-        last = [key for camera in range(len(self._samples.cameras)) for key in mount_keys(camera)]
+        last = [key for camera in range(len(self.samples.cameras)) for key in mount_keys(camera)]
         self._values, _ = levenberg_marquardt(graph, start, iterations=iterations, last=last, step=self._step)
-        self._scale = scale
-        for camera, name in enumerate(self._samples.cameras):
+        self.scale = scale
+        for camera, name in enumerate(self.samples.cameras):
             self.mounts[name] = mount_from_points(self._values, camera, points[camera])
         return float(graph.error(self._values))
 
     def widen_joint_priors(self) -> None:
         """Widen the joint rotation priors that the last solution contradicts."""
         # The ticks of a T-pose have a separate prior. They are no evidence for the posture at other ticks.
-        usual = ~self._samples.posture.t_pose
+        usual = ~self.samples.posture.t_pose
         if usual.any():
-            poses, times_ns = self.poses()[usual], self._samples.times_ns[usual]
-            self._rest_bones = widen_joint_priors(self._skeleton, self._bones, poses, times_ns)
+            poses, times_ns = self.poses()[usual], self.samples.times_ns[usual]
+            self._rest_bones = widen_joint_priors(self._skeleton, self.bones, poses, times_ns)
 
     def test_hinges(self) -> bool:
         """Test the hinges that cameras can contradict, and loosen the violated hinges.
@@ -173,15 +146,15 @@ class CalibrationGraph:
         Returns:
             True if a hinge is violated. The graph then has loosened hinges and must be solved again.
         """
-        tested = observable_hinges(self._hinges, self._samples.bones)
+        tested = observable_hinges(self._hinges, self.samples.bones)
         if not tested:
             return False
         before = self._rest_bones, self._hinges, self._values, dict(self.mounts)
         free = with_hinge_slack(self._rest_bones, {hinge.lower: FREE_SIGMA_M for hinge in tested})
         self._set_rest_bones(free, repetitions=1.0)
-        self.solve(self._scale)
+        self.solve(self.scale)
         violated = with_hinge_slack(self._rest_bones, hinge_violation_sigma(self.linearised()))
-        self._set_rest_bones(violated, repetitions=samples_per_gesture(self._samples.times_ns))
+        self._set_rest_bones(violated, repetitions=samples_per_gesture(self.samples.times_ns))
         if not self.hinge_violation_m():
             self._rest_bones, self._hinges, self._values, self.mounts = before
             return False
@@ -198,19 +171,13 @@ class CalibrationGraph:
 
     def poses(self) -> FloatArray:
         """Return the bone poses world_from_bone (K,B,4,4) of the last solution, metres."""
-        ticks = self._samples.valid.shape[1]
-        return np.array(
-            [
-                [self._values.atPose3(bone_key(tick, bone)).matrix() for bone in range(len(self._bones))]
-                for tick in range(ticks)
-            ]
-        )
+        return poses_from_values(self._values, self.samples.valid.shape[1], len(self.bones))
 
     def linearised(self) -> LinearisedCalibration:
         """Return the graph linearised at the last solution."""
-        cameras = self._samples.cameras
-        all_points = self._samples.mount_points(self._scale)
-        linear = linearise(self._graph(self._metric_poses(self._scale), self._scale), self._values)
+        cameras = self.samples.cameras
+        all_points = self.samples.mount_points(self.scale)
+        linear = linearise(self._graph(self._metric_poses(self.scale), self.scale), self._values)
         return LinearisedCalibration(
             linear=linear,
             body=BodyModel(bones=self._rest_bones, hinges=self._hinges),
@@ -224,14 +191,14 @@ class CalibrationGraph:
                 for camera, name in enumerate(cameras)
             },
             first_joint_factor=self._first_joint_factor,
-            t_pose=self._samples.posture.t_pose,
+            t_pose=self.samples.posture.t_pose,
             named_mounts=self._named_mounts(),
         )
 
     def measurement_factors(self, camera: int) -> IntArray:
         """Return the factor indices (N,4) of a camera's N measured poses. Each pose has four factors."""
         first = self._prior_factors()[camera] + POINTS_PER_MOUNT
-        count = int(self._samples.valid[camera].sum())
+        count = int(self.samples.valid[camera].sum())
         return np.asarray(
             first + POINTS_PER_MOUNT * np.arange(count)[:, None] + np.arange(POINTS_PER_MOUNT),
             dtype=np.int64,
@@ -239,12 +206,12 @@ class CalibrationGraph:
 
     def _prior_factors(self) -> IntArray:
         """Return the index (C,) of the first factor of each camera's mount prior."""
-        counts = POINTS_PER_MOUNT * (1 + self._samples.valid.sum(axis=1))
+        counts = POINTS_PER_MOUNT * (1 + self.samples.valid.sum(axis=1))
         return np.asarray(np.cumsum(counts) - counts, dtype=np.int64)
 
     def _named_mounts(self) -> IntArray:
         """Return the indices of the factors of mount rotations that only the camera's name gives."""
-        named = np.array([self._priors[name].by_name for name in self._samples.cameras], dtype=bool)
+        named = np.array([self.priors[name].by_name for name in self.samples.cameras], dtype=bool)
         # The first factor of a prior is for the centre, the others are for the rotation.
         return np.asarray((self._prior_factors()[named][:, None] + np.arange(1, POINTS_PER_MOUNT)).ravel())
 
@@ -263,7 +230,7 @@ class CalibrationGraph:
 
     def _metric_poses(self, scale: float) -> FloatArray:
         """Return the measured camera poses (C,K,4,4), with the centres in metres."""
-        poses = self._samples.map_from_cam.copy()
+        poses = self.samples.map_from_cam.copy()
         poses[..., :3, 3] *= scale
         return poses
 
@@ -273,10 +240,10 @@ class CalibrationGraph:
         The factors have this order. First, for each camera: the prior of its mount, then its measurements.
         Second, for each tick: the joints and hinges. Third, for each tick: the posture.
         """
-        samples, graph = self._samples, gtsam.NonlinearFactorGraph()
+        samples, graph = self.samples, gtsam.NonlinearFactorGraph()
         all_points = samples.mount_points(scale)
         for camera, name in enumerate(samples.cameras):
-            prior, points = self._priors[name], all_points[camera]
+            prior, points = self.priors[name], all_points[camera]
             add_mount_prior(
                 graph,
                 camera,
@@ -292,7 +259,7 @@ class CalibrationGraph:
         self._first_joint_factor = int(graph.size())
         for tick in range(samples.valid.shape[1]):
             (t_pose if samples.posture.t_pose[tick] else usual).add(graph, tick)
-        posture = AttitudeFactors(self._bones, samples.posture)
+        posture = AttitudeFactors(self.bones, samples.posture)
         for tick in range(samples.valid.shape[1]):
             posture.add(graph, tick)
         return graph
@@ -303,7 +270,7 @@ class CalibrationGraph:
         The T-pose prior has the weight of a single tick, distributed over all ticks of the T-pose.
         """
         slack_m = scale * self.slack_factor * self._slack_map
-        repetitions = float(np.sqrt(max(self._samples.posture.t_pose.sum(), 1)))
+        repetitions = float(np.sqrt(max(self.samples.posture.t_pose.sum(), 1)))
         return (
             JointFactors(self._rest_bones, self._hinges, prior_scale=JOINT_PRIOR_SCALE, slack_m=slack_m),
             JointFactors(self._t_pose_bones, self._hinges, prior_scale=repetitions, slack_m=slack_m),
@@ -315,8 +282,8 @@ class CalibrationGraph:
         Before the first solution, inverse kinematics from the measured camera poses gives the initial values.
         """
         if self._values is not None:
-            return self._with_mounts(self._rescaled(scale / self._scale), scale)
-        samples = self._samples
+            return self._with_mounts(self._rescaled(scale / self.scale), scale)
+        samples = self.samples
         measured = {
             bone: fill_gaps(world_from_cam[camera], samples.valid[camera]) @ invert(self.mounts[name])
             for camera, (name, bone) in reversed(
@@ -324,13 +291,13 @@ class CalibrationGraph:
             )
             if samples.valid[camera].any()
         }
-        poses = pose_bones(self._skeleton, self._bones, measured)
+        poses = pose_bones(self._skeleton, self.bones, measured)
         return self._with_mounts(values_from_poses(poses), scale)
 
     def _with_mounts(self, values: Any, scale: float) -> Any:
         """Insert the points of all mounts into the values, and return the values."""
-        for camera, points in enumerate(self._samples.mount_points(scale)):
-            insert_mount_points(values, camera, self.mounts[self._samples.cameras[camera]], points)
+        for camera, points in enumerate(self.samples.mount_points(scale)):
+            insert_mount_points(values, camera, self.mounts[self.samples.cameras[camera]], points)
         return values
 
     def _rescaled(self, ratio: float) -> Any:

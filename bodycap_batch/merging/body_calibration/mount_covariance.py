@@ -21,6 +21,7 @@ from bodycap_batch.merging.graph.error_modes import (
     BodyModel,
     ErrorModes,
     joint_residual_jacobian,
+    no_modes,
     posture_bias_modes,
     stack_modes,
 )
@@ -161,11 +162,7 @@ class LinearisedCalibration:
         noise = change @ (gain * self.row_variances()) @ gain.T @ change.T
         values, vectors = np.linalg.eigh(0.5 * (noise + noise.T))
         white = vectors * np.sqrt(np.maximum(values, 0.0))
-        count = len(white)
-        zero = np.zeros((len(self.body.bones), 3, count))
-        noise_modes = ErrorModes(
-            mounts=self._by_camera(white), log_scale=np.zeros(count), rest=zero, offsets_m=zero
-        )
+        noise_modes = replace(no_modes(self.body.bones, (), len(white)), mounts=self._by_camera(white))
         return stack_modes([noise_modes, self.propagated(reduced, body_modes)])
 
     def propagated(self, reduced: ReducedSystem, body_modes: ErrorModes) -> ErrorModes:

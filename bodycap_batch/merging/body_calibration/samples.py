@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body.bones import Bone, kinematic_chain
 from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, MIN_SIGMA_M, MIN_SIGMA_RAD, CameraTrack
 from bodycap_batch.merging.graph.factors import MountPoints
 from bodycap_batch.merging.graph.posture import Posture, find_posture
-from bodycap_batch.model.skeleton import Mount, SkeletonModel
 
 MAP_ERROR_M = 0.005
 """Sigma of the positional error of a map along a camera path, metres.
@@ -39,12 +37,6 @@ MIN_SAMPLES = 10
 
 If a camera has fewer such frames, it gets fewer samples. If all cameras together have fewer such frames, the
 calibration fails. Evidence: none.
-"""
-MIN_COMMON_FRAMES = 15
-"""Minimum number of common frames of a camera and the reference camera. Evidence: none.
-
-The roll search and the scales of the limbs skip a camera with fewer common frames. The value is half a second
-at 30 fps.
 """
 
 
@@ -149,60 +141,6 @@ def take_samples(
         white_noise_share=float(((white_map / sigma_map) ** 2).mean()),
         posture=find_posture(tracks[0].scaled(provisional), times_ns, vertical, t_pose_ns),
     )
-
-
-@dataclass(frozen=True, slots=True)
-class CameraSubset:
-    """The data for a separate calibration of some of the cameras, for example of one limb.
-
-    Attributes:
-        bones: Bones of the kinematic chain between these cameras.
-        samples: Poses of these cameras at the sampled ticks.
-    """
-
-    bones: tuple[Bone, ...]
-    samples: CalibrationSamples
-
-
-def sample_subset(
-    skeleton: SkeletonModel,
-    mounts: Mapping[str, Mount],
-    tracks: Sequence[CameraTrack],
-    provisional: float,
-    count: int,
-    hints: PostureHints,
-) -> CameraSubset:
-    """Sample some of the cameras for a separate calibration.
-
-    Args:
-        skeleton: The skeleton of the body.
-        mounts: By camera, its mount prior.
-        tracks: Cleaned tracks of these cameras. The track of the reference camera is the first.
-        provisional: Approximate scale, metres per map unit.
-        count: Maximum number of times. Times for a T-pose or for a rarely measured camera are added to these.
-        hints: Facts about the posture that are known before the calibration.
-
-    Returns:
-        The bones between these cameras, and the sampled camera poses.
-    """
-    roles = [mounts[track.camera].role for track in tracks]
-    bones = kinematic_chain(skeleton, roles)
-    index = {bone.role: number for number, bone in enumerate(bones)}
-    own = [replace(track, bone=index[role]) for track, role in zip(tracks, roles, strict=True)]
-    return CameraSubset(bones, take_samples(own, provisional, count, hints.vertical, hints.t_pose_ns))
-
-
-def count_common_frames(reference: CameraTrack, track: CameraTrack) -> int:
-    """Return the number of frames of the reference camera at which another camera was measured too.
-
-    Args:
-        reference: Track of the reference camera.
-        track: Track of the other camera.
-
-    Returns:
-        The number of common frames.
-    """
-    return int(track.poses_at(reference.times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)[1].sum())
 
 
 def _sample_times(tracks: Sequence[CameraTrack], count: int, t_pose_ns: tuple[int, int] | None) -> IntArray:

@@ -18,7 +18,7 @@ height is given, the sigma of the result is at least `STATURE_SIGMA`.
 Other modules estimate scales for other purposes. These scales are not used in the result:
 
 - ``body/provisional_scale.py``: the provisional scale, the initial value of the calibration.
-- ``map_alignment/similarity_refinement.py`` and ``map_alignment/scale_sources.py``: the scale of the main map
+- ``map_alignment/similarity_refinement.py`` and ``map_alignment/walked_floor.py``: the scale of the main map
   while other maps are aligned to it. It uses the limbs' reach, the floor and the sources given in the job.
 """
 

@@ -7,13 +7,9 @@ systems place the joints at different points of the same body.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-import numpy as np
-
-from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.bones import Bone
-from bodycap_batch.merging.graph.error_modes import ErrorModes
+from bodycap_batch.merging.graph.error_modes import ErrorModes, no_modes
 from bodycap_batch.model.skeleton_presets import split_side
 
 PROPORTION_SIGMA = 0.04
@@ -41,38 +37,6 @@ Derived from the skeletons of three makers, see docs/decisions/body_calibration.
 """
 
 
-@dataclass(frozen=True, slots=True)
-class SkeletonErrorModes:
-    """Error modes of a skeleton that was scaled from a stature. They increase the sigmas of the calibration.
-
-    Attributes:
-        bone_lengths: Error modes of the bone lengths. People of equal stature have different bone lengths.
-        joint_placement: Error modes of the joint positions. Motion capture systems place the joints
-            differently.
-    """
-
-    bone_lengths: ErrorModes
-    joint_placement: ErrorModes
-
-
-def skeleton_error_modes(
-    bones: Sequence[Bone], cameras: Sequence[str], stature_m: float
-) -> SkeletonErrorModes:
-    """Return the error modes of a skeleton that is scaled from a stature.
-
-    Args:
-        bones: Bones of the graph.
-        cameras: Names of the cameras. The modes do not change the mounts of these cameras.
-        stature_m: Stature of the subject, metres.
-
-    Returns:
-        The error modes of bone lengths and of joint placement.
-    """
-    return SkeletonErrorModes(
-        bone_length_modes(bones, cameras), joint_placement_modes(bones, cameras, stature_m)
-    )
-
-
 def bone_length_modes(bones: Sequence[Bone], cameras: Sequence[str]) -> ErrorModes:
     """Return one error mode for each kind of bone. For example, both forearms are one kind.
 
@@ -87,11 +51,11 @@ def bone_length_modes(bones: Sequence[Bone], cameras: Sequence[str]) -> ErrorMod
     """
     parts = _part_names(bones)
     names = sorted({part for part, bone in zip(parts, bones, strict=True) if bone.parent >= 0})
-    offsets_m = np.zeros((len(bones), 3, len(names)))
+    out = no_modes(bones, cameras, len(names))
     for index, bone in enumerate(bones):
         if bone.parent >= 0:
-            offsets_m[index, :, names.index(parts[index])] = PROPORTION_SIGMA * bone.offset_m
-    return _modes_from_offsets(offsets_m, cameras)
+            out.offsets_m[index, :, names.index(parts[index])] = PROPORTION_SIGMA * bone.offset_m
+    return out
 
 
 def joint_placement_modes(bones: Sequence[Bone], cameras: Sequence[str], stature_m: float) -> ErrorModes:
@@ -118,29 +82,18 @@ def joint_placement_modes(bones: Sequence[Bone], cameras: Sequence[str], stature
         for axis in range(3)
         if _JOINT_PLACEMENT_SIGMA[part][axis]
     ]
-    offsets_m = np.zeros((len(bones), 3, len(moves)))
+    out = no_modes(bones, cameras, len(moves))
     for mode, (part, axis) in enumerate(moves):
         size_m = stature_m * _JOINT_PLACEMENT_SIGMA[part][axis]
         for index, bone in enumerate(bones):
             outwards = -1.0 if axis == 0 and split_side(bone.role)[0] == "Right" else 1.0
             if parts[index] == part and bone.parent >= 0:
-                offsets_m[index, axis, mode] += outwards * size_m
+                out.offsets_m[index, axis, mode] += outwards * size_m
             if part == "Spine1" and bone.parent >= 0 and parts[bone.parent] == part:
-                offsets_m[index, axis, mode] -= size_m
-    return _modes_from_offsets(offsets_m, cameras)
+                out.offsets_m[index, axis, mode] -= size_m
+    return out
 
 
 def _part_names(bones: Sequence[Bone]) -> list[str]:
     """Return the role of each bone without the side, for example ``Arm`` for ``LeftArm``."""
     return [split_side(bone.role)[1] for bone in bones]
-
-
-def _modes_from_offsets(offsets_m: FloatArray, cameras: Sequence[str]) -> ErrorModes:
-    """Return M error modes that change only the offsets of the bones, by `offsets_m` (B,3,M)."""
-    count = offsets_m.shape[2]
-    return ErrorModes(
-        mounts={camera: np.zeros((6, count)) for camera in cameras},
-        log_scale=np.zeros(count),
-        rest=np.zeros_like(offsets_m),
-        offsets_m=offsets_m,
-    )

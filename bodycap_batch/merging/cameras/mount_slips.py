@@ -19,7 +19,15 @@ from scipy.special import logsumexp
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
 from bodycap_batch.merging.cameras.track import CameraTrack
-from bodycap_batch.model.geometry import invert, make_transform, rotation_angle_rad, so3_exp, so3_log
+from bodycap_batch.merging.cameras.track_outliers import NEXT_FRAME
+from bodycap_batch.model.geometry import (
+    invert,
+    make_transform,
+    pose_vectors,
+    rotation_angle_rad,
+    so3_exp,
+    so3_log,
+)
 from bodycap_batch.model.skeleton import MountSlip
 
 _FRAME_S = 1.0 / 30.0
@@ -49,8 +57,6 @@ _USUAL_WINDOWS = 300
 _MIN_STEP = float(np.radians(5.0)), 0.015
 """Minimum step of a slip: radians, or metres. A smaller step is within the uncertainty of a mount."""
 
-_NEXT_FRAME = 1.5
-"""Maximum step between successive frames without a lost frame between them, in frame intervals."""
 _PIVOT_ITERATIONS = 10
 """Number of iterations of the robust fit of the pivot. Evidence: none."""
 _SMOOTH_S = 0.1
@@ -144,22 +150,6 @@ class _Likelihoods(NamedTuple):
     variance: FloatArray
 
 
-class _Step(NamedTuple):
-    """A step of the path.
-
-    Attributes:
-        first_after: Index of the first frame after the step.
-        before_from_after: (4,4) pose of the camera after the step, in its axes before the step, metres.
-        sigma_rad: Sigma of the rotation per axis.
-        sigma_m: Sigma of the translation per axis.
-    """
-
-    first_after: int
-    before_from_after: FloatArray
-    sigma_rad: float
-    sigma_m: float
-
-
 def find_slip(track: CameraTrack) -> MountSlip | None:
     """Return the slip of a camera's mount.
 
@@ -171,15 +161,7 @@ def find_slip(track: CameraTrack) -> MountSlip | None:
         another reason, such as a wrong part of the map.
     """
     steps = _steps(track)
-    if len(steps) != 1:
-        return None
-    (step,) = steps
-    return MountSlip(
-        time_ns=int(track.times_ns[step.first_after]),
-        before_from_after=step.before_from_after,
-        sigma_rad=step.sigma_rad,
-        sigma_m=step.sigma_m,
-    )
+    return steps[0] if len(steps) == 1 else None
 
 
 def without_slip(track: CameraTrack, slip: MountSlip, scale: float) -> CameraTrack:
@@ -194,7 +176,7 @@ def without_slip(track: CameraTrack, slip: MountSlip, scale: float) -> CameraTra
     return replace(track, map_from_cam=poses)
 
 
-def _steps(track: CameraTrack) -> list[_Step]:
+def _steps(track: CameraTrack) -> list[MountSlip]:
     """Return the steps of a path, without blocks of frames from which the path comes back."""
     stride = max(1, round(_FRAME_S * 1e9 / float(np.median(np.diff(track.times_ns)))))
     frames = np.arange(0, len(track.times_ns), stride)
@@ -218,16 +200,18 @@ def _steps(track: CameraTrack) -> list[_Step]:
     evidence = np.asarray(logsumexp(by_duration, axis=0) - np.log(len(by_duration)))
     # A slip is as likely in a long take as in a short one, but a long take has more instants.
     evidence -= np.log(max(1.0, len(evidence) / _USUAL_WINDOWS))
-    out: list[_Step] = []
+    out: list[MountSlip] = []
     for index in _peaks(evidence):
         window, weights = windows.take(slice(index, index + 1)), weights_of(np.array([index]))
         if evidence[index] - _wrong_frames_evidence(window, weights) < _LOG_EVIDENCE:
             continue
         under_way = _transitions()[int(np.argmax(by_duration[:, index]))]
-        step = _mean_step(int(window.first_after[0]), _both_parts(window, under_way), weights, pivot_in_cam)
+        first_after = int(window.first_after[0])
+        time_ns = int(track.times_ns[first_after])
+        step = _mean_step(time_ns, _both_parts(window, under_way), weights, pivot_in_cam)
         if out and _undoes(step.before_from_after, out[-1].before_from_after):
             out.pop()
-        elif _is_slip(step.before_from_after) and not _is_along_path(track, step, stride):
+        elif _is_slip(step.before_from_after) and not _is_along_path(track, step, first_after, stride):
             out.append(step)
     return out
 
@@ -239,7 +223,7 @@ def _pivot_m(track: CameraTrack, frames: IntArray) -> FloatArray:
     easier to see.
     """
     poses, times = track.map_from_cam[frames], track.times_ns[frames]
-    even = np.diff(times) < _NEXT_FRAME * np.median(np.diff(times))
+    even = np.diff(times) < NEXT_FRAME * np.median(np.diff(times))
     even = even[1:] & even[:-1]
     turn, move = (np.diff(poses[:, :3, axes], n=2, axis=0)[even] for axes in (slice(3), 3))
     pivot, weight = np.zeros(3), np.ones(len(turn))
@@ -442,7 +426,7 @@ def _wrong_frames_evidence(window: _Windows, weights: Sequence[FloatArray]) -> f
     return float(np.logaddexp(0.0, some - total[0]))
 
 
-def _is_along_path(track: CameraTrack, step: _Step, stride: int) -> bool:
+def _is_along_path(track: CameraTrack, step: MountSlip, first_after: int, stride: int) -> bool:
     """Return True if a step is rather what the camera moves in a few frame intervals than a slip.
 
     Such a step comes from frames that the recording lacks although its timestamps do not show it. The
@@ -451,10 +435,11 @@ def _is_along_path(track: CameraTrack, step: _Step, stride: int) -> bool:
     Args:
         track: Path of the camera.
         step: A step of the path.
+        first_after: Index of the first frame after the step.
         stride: Number of frames of the track for each frame that is compared.
     """
-    index = step.first_after + stride * np.arange(-_HALF_FRAMES // 2, _HALF_FRAMES // 2)
-    moves = _twists(invert(track.map_from_cam[index[:-1]]) @ track.map_from_cam[index[1:]])
+    index = first_after + stride * np.arange(-_HALF_FRAMES // 2, _HALF_FRAMES // 2)
+    moves = pose_vectors(invert(track.map_from_cam[index[:-1]]) @ track.map_from_cam[index[1:]])
     moves = np.delete(moves, _HALF_FRAMES // 2 - 1, axis=0)
     velocity = np.median(moves, axis=0)
     spread = ((moves - velocity) ** 2).mean(axis=0).reshape(2, 3).mean(axis=1)
@@ -463,17 +448,12 @@ def _is_along_path(track: CameraTrack, step: _Step, stride: int) -> bool:
 
     def log_likelihood(means: FloatArray, variances: FloatArray) -> float:
         variances = np.repeat(variances + np.array([step.sigma_rad, step.sigma_m]) ** 2, 3, axis=1)
-        square = (_twists(step.before_from_after[None]) - means) ** 2 / variances
+        square = (pose_vectors(step.before_from_after[None]) - means) ** 2 / variances
         values = -0.5 * (square + np.log(variances)).sum(axis=1)
         return float(logsumexp(values) - np.log(len(values)))
 
     along = log_likelihood(intervals * velocity, intervals**2 * spread)
     return along > log_likelihood(np.zeros(6), kinds * np.array(_STEP_SIGMAS) ** 2)
-
-
-def _twists(poses: FloatArray) -> FloatArray:
-    """Return the rotation vectors and translations (N,6) of poses (N,4,4)."""
-    return np.hstack([so3_log(poses[:, :3, :3]), poses[:, :3, 3]])
 
 
 def _peaks(evidence: FloatArray) -> list[int]:
@@ -488,15 +468,15 @@ def _peaks(evidence: FloatArray) -> list[int]:
 
 
 def _mean_step(
-    first_after: int,
+    time_ns: int,
     found: Sequence[_Likelihoods],
     weights: Sequence[FloatArray],
     pivot_in_cam: FloatArray,
-) -> _Step:
+) -> MountSlip:
     """Return the mean step of one window over the motions, and its sigmas.
 
     Args:
-        first_after: Index of the first frame after the step.
+        time_ns: Common time of the first frame after the step.
         found: Likelihoods of rotation and translation in this one window; the translation is the pivot's.
         weights: (1,G) log of the shares of the motions, for rotation and translation.
         pivot_in_cam: (4,4) axes of the camera at the pivot, in the camera's frame.
@@ -513,7 +493,12 @@ def _mean_step(
     # The translation was fitted in the axes of the camera after the step.
     step = pivot_in_cam @ make_transform(turn, turn @ means[1]) @ invert(pivot_in_cam)
     arm_m = float(np.linalg.norm(pivot_in_cam[:3, 3])) * np.sqrt(2.0 / 3.0)
-    return _Step(first_after, step, sigmas[0], float(np.hypot(sigmas[1], arm_m * sigmas[0])))
+    return MountSlip(
+        time_ns=time_ns,
+        before_from_after=step,
+        sigma_rad=sigmas[0],
+        sigma_m=float(np.hypot(sigmas[1], arm_m * sigmas[0])),
+    )
 
 
 def _undoes(step: FloatArray, previous: FloatArray) -> bool:

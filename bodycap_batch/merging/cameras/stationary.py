@@ -19,11 +19,11 @@ from the mean orientation, in radians. Evidence: docs/decisions/merging.md."""
 _MAX_NOISE_FACTOR = 2.0
 """Maximum factor by which noise widens the maximum deviations of position and rotation. Without this maximum,
 moving cameras with noisy poses would be treated as stationary."""
-_WINDOW_FRAMES = 15
+WINDOW_FRAMES = 15
 """Number of localised frames that are averaged: half a second at 30 fps. The average reduces noise, because
 noise is independent between frames. A movement of the body is not independent between frames, so it
 remains."""
-_PERCENTILE, _PERCENTILE_SIGMAS = 90.0, 2.5
+_PERCENTILE, PERCENTILE_SIGMAS = 90.0, 2.5
 """Percentile of the deviations that is compared with the bounds, and the value of this percentile in sigmas
 of the noise. For Gaussian noise with the same sigma on all three axes, the 90th percentile of the norm is 2.5
 sigmas (chi distribution with three degrees of freedom)."""
@@ -66,7 +66,7 @@ def stationary_cameras(inputs: MergeInputs, trajectories: Sequence[Trajectory]) 
 
     Args:
         inputs: The inputs of the merge stage. Only the clocks are used.
-        trajectories: Trajectories of the cameras with at least `_WINDOW_FRAMES` localised frames.
+        trajectories: Trajectories of the cameras with at least `WINDOW_FRAMES` localised frames.
 
     Returns:
         The names of the stationary cameras.
@@ -109,7 +109,7 @@ def _keeps_position(path: _CameraPath, others: Iterable[_CameraPath]) -> bool:
     span = int(path.times_ns.min()), int(path.times_ns.max())
     deviations = [other.deviations_during(*span) for other in others if other.gauge == path.gauge]
     largest = max(
-        float(np.percentile(each, _PERCENTILE)) for each in deviations if len(each) >= _WINDOW_FRAMES
+        float(np.percentile(each, _PERCENTILE)) for each in deviations if len(each) >= WINDOW_FRAMES
     )
     centred = path.centres - np.median(path.centres, axis=0)
     return _deviates_little(centred, _MAX_DEVIATION_RATIO * largest, path.sigma_map)
@@ -126,11 +126,15 @@ def _deviates_little(deviations: FloatArray, limit: float, sigma: float) -> bool
         limit: Maximum deviation of a camera without noise.
         sigma: Sigma of the noise of one frame per axis.
     """
-    count = len(deviations) // _WINDOW_FRAMES
-    windows = deviations[: count * _WINDOW_FRAMES].reshape(-1, _WINDOW_FRAMES, 3).mean(axis=1)
-    with_noise = float(np.hypot(limit, _PERCENTILE_SIGMAS * sigma / np.sqrt(_WINDOW_FRAMES)))
-    bound = min(with_noise, _MAX_NOISE_FACTOR * limit)
+    count = len(deviations) // WINDOW_FRAMES
+    windows = deviations[: count * WINDOW_FRAMES].reshape(-1, WINDOW_FRAMES, 3).mean(axis=1)
+    bound = with_noise(limit, PERCENTILE_SIGMAS * sigma / float(np.sqrt(WINDOW_FRAMES)))
     mean, single = (
         float(np.percentile(np.linalg.norm(each, axis=1), _PERCENTILE)) for each in (windows, deviations)
     )
-    return mean < bound and single < np.sqrt(_WINDOW_FRAMES) * bound
+    return mean < bound and single < np.sqrt(WINDOW_FRAMES) * bound
+
+
+def with_noise(limit: float, noise: float) -> float:
+    """Return a limit of a deviation, widened by its noise, at most by `_MAX_NOISE_FACTOR`."""
+    return min(float(np.hypot(limit, noise)), _MAX_NOISE_FACTOR * limit)

@@ -102,6 +102,14 @@ class CameraTrack:
         return poses, inside & (self.times_ns[after] - self.times_ns[before] <= max_gap_ns)
 
 
+def nearest_times(sorted_ns: IntArray, times_ns: IntArray) -> IntArray:
+    """Return the nearest of the sorted times (N,) for each of `times_ns` (T,)."""
+    after = np.clip(np.searchsorted(sorted_ns, times_ns), 0, len(sorted_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    closer = np.abs(sorted_ns[before] - times_ns) <= np.abs(sorted_ns[after] - times_ns)
+    return np.asarray(np.where(closer, sorted_ns[before], sorted_ns[after]))
+
+
 def make_track(inputs: MergeInputs, trajectory: Trajectory, bone: int) -> CameraTrack:
     """Return the localised frames of a trajectory on the common clock.
 

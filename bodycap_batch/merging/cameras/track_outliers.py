@@ -23,7 +23,7 @@ _JUMP_RATIO = 2.0
 differences of a step are 1, -2 and 1 times its height. Evidence: docs/decisions/merging.md."""
 _DIFFERENCE_FRAMES = 4
 """Number of successive frames that a third difference compares."""
-_NEXT_FRAME = 1.5
+NEXT_FRAME = 1.5
 """Maximum step between successive frames without a lost frame between them, in frame intervals. Derivation:
 the middle between one and two intervals."""
 _END_FRAMES = 2
@@ -147,7 +147,7 @@ def _runs_with_jumps(bad: BoolArray, time: FloatArray, centre_m: FloatArray) -> 
     steep = np.linalg.norm(divided, axis=1) > _JUMP_RATIO * OUTLIER_LIMIT_M
     jump[1:-2] |= steep
     jump[2:-1] |= steep
-    block = np.cumsum(np.diff(time, prepend=time[:1]) > _NEXT_FRAME)
+    block = np.cumsum(np.diff(time, prepend=time[:1]) > NEXT_FRAME)
     few = np.bincount(block, minlength=1)[block] < _DIFFERENCE_FRAMES
     bent = np.linalg.norm(np.diff(centre_m, n=2, axis=0), axis=1) > OUTLIER_LIMIT_M
     jump[1:-1] |= bent & few[1:-1]

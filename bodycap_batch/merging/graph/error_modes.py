@@ -5,8 +5,8 @@ Each error mode is one column of a square root of the calibration's covariance.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -51,6 +51,22 @@ class ErrorModes:
     def joint_modes(self, bone: Bone, index: int) -> FloatArray:
         """Return the change (6,M) of a bone's rest pose on its parent: right perturbation, rotation first."""
         return np.concatenate([self.rest[index], bone.mean_rotation.T @ self.offsets_m[index]])
+
+
+def no_modes(bones: Sequence[Bone], cameras: Iterable[str], count: int) -> ErrorModes:
+    """Return error modes that change nothing.
+
+    Args:
+        bones: The graph's bones.
+        cameras: Names of the cameras.
+        count: Number of modes.
+    """
+    return ErrorModes(
+        mounts={camera: np.zeros((6, count)) for camera in cameras},
+        log_scale=np.zeros(count),
+        rest=np.zeros((len(bones), 3, count)),
+        offsets_m=np.zeros((len(bones), 3, count)),
+    )
 
 
 def stack_modes(parts: Sequence[ErrorModes]) -> ErrorModes:
@@ -124,28 +140,20 @@ of the range is variation within seconds. At one tick, the bias and the variatio
 error. Only the bias changes the mounts. Evidence: none."""
 
 
-def posture_bias_modes(
-    bones: Sequence[Bone], cameras: Sequence[str], share: float | FloatArray
-) -> ErrorModes:
+def posture_bias_modes(bones: Sequence[Bone], cameras: Sequence[str], share: float) -> ErrorModes:
     """Return the error modes of a biased posture: joints that stay away from the rest pose.
 
     Args:
         bones: The graph's bones.
         cameras: Names of the cameras. Their mounts do not change.
-        share: Fraction of the joint's everyday range: one value for all bones, or (B,) by bone.
+        share: Fraction of the joint's everyday range.
     """
-    shares = np.broadcast_to(share, len(bones))
     jointed = [index for index, bone in enumerate(bones) if bone.parent >= 0]
-    rest = np.zeros((len(bones), 3, 3 * len(jointed)))
+    out = no_modes(bones, cameras, 3 * len(jointed))
     for number, index in enumerate(jointed):
         half = np.linalg.cholesky(bones[index].rotation_covariance)
-        rest[index, :, 3 * number : 3 * number + 3] = shares[index] * half
-    return ErrorModes(
-        mounts={camera: np.zeros((6, rest.shape[-1])) for camera in cameras},
-        log_scale=np.zeros(rest.shape[-1]),
-        rest=rest,
-        offsets_m=np.zeros_like(rest),
-    )
+        out.rest[index, :, 3 * number : 3 * number + 3] = share * half
+    return out
 
 
 def map_error_modes(bones: Sequence[Bone], sigmas: Mapping[str, FloatArray]) -> ErrorModes:
@@ -157,12 +165,10 @@ def map_error_modes(bones: Sequence[Bone], sigmas: Mapping[str, FloatArray]) -> 
         bones: The graph's bones.
         sigmas: By camera, (2,) sigmas of rotation (radians) and position (metres) per axis.
     """
-    count = 6 * len(sigmas)
-    mounts = {camera: np.zeros((6, count)) for camera in sigmas}
-    for index, (camera, (rotation_rad, position_m)) in enumerate(sigmas.items()):
-        mounts[camera][:, 6 * index : 6 * index + 6] = np.diag(np.repeat([rotation_rad, position_m], 3))
-    unchanged = np.zeros((len(bones), 3, count))
-    return ErrorModes(mounts=mounts, log_scale=np.zeros(count), rest=unchanged, offsets_m=unchanged)
+    out = no_modes(bones, sigmas, 6 * len(sigmas))
+    for index, (camera, sigma) in enumerate(sigmas.items()):
+        out.mounts[camera][:, 6 * index : 6 * index + 6] = np.diag(np.repeat(sigma, 3))
+    return out
 
 
 def mount_perturbation(joint_from_cam: FloatArray, change: FloatArray) -> FloatArray:
@@ -181,9 +187,8 @@ def scale_modes(bones: Sequence[Bone], sigma_log: float, slope: Mapping[str, Flo
         sigma_log: Sigma of the scale's logarithm.
         slope: By camera, (6,) change of the mount per unit of log scale.
     """
-    return ErrorModes(
+    return replace(
+        no_modes(bones, (), 1),
         mounts={camera: sigma_log * change[:, None] for camera, change in slope.items()},
         log_scale=np.array([sigma_log]),
-        rest=np.zeros((len(bones), 3, 1)),
-        offsets_m=np.zeros((len(bones), 3, 1)),
     )

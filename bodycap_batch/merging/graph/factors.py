@@ -17,6 +17,9 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.merging.body.bones import JOINT_SLACK_M, Bone, Hinge
 from bodycap_batch.model.geometry import nearest_rotation, skew
 
+POINTS_PER_MOUNT = 4
+"""Number of points that represent a mount. Each measured camera pose and each mount prior adds one factor per
+point to the graph."""
 MAX_BONES = 64
 """Maximum number of bones of a graph. The keys of one bone at two successive ticks differ by this number."""
 GEMAN_MCCLURE_C = 6.0
@@ -42,7 +45,8 @@ def velocity_key(tick: int, bone: int) -> int:
 
 def mount_keys(camera: int) -> list[int]:
     """Return the keys of a mount's points in the bone's frame: the centre point, then three axis points."""
-    return [int(gtsam.symbol("m", 4 * camera + point)) for point in range(4)]
+    first = POINTS_PER_MOUNT * camera
+    return [int(gtsam.symbol("m", first + point)) for point in range(POINTS_PER_MOUNT)]
 
 
 class MotionState(NamedTuple):
@@ -250,3 +254,10 @@ def values_from_poses(poses: FloatArray) -> Any:
         for bone in range(poses.shape[1]):
             values.insert(bone_key(tick, bone), gtsam.Pose3(poses[tick, bone]))
     return values
+
+
+def poses_from_values(values: Any, ticks: int, bones: int) -> FloatArray:
+    """Return the poses (T,B,4,4) of the bones from GTSAM values."""
+    return np.array(
+        [[values.atPose3(bone_key(tick, bone)).matrix() for bone in range(bones)] for tick in range(ticks)]
+    )

@@ -5,89 +5,29 @@ Both contain the noise of the measurements and the errors of the calibration.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from scipy import sparse
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.merging.body.bones import Bone
-from bodycap_batch.merging.cameras.track import CameraTrack
-from bodycap_batch.merging.graph.error_modes import BodyModel, ErrorModes, joint_residual_jacobian
-from bodycap_batch.merging.graph.factors import MotionState, bone_key
+from bodycap_batch.merging.graph.error_modes import ErrorModes, joint_residual_jacobian
+from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.merging.graph.linearisation import LinearisedGraph, linearise
+from bodycap_batch.merging.graph.motion_graph import JointUncertainty, MotionGraph
 from bodycap_batch.model.block_tridiagonal import BlockTridiagonal
 from bodycap_batch.model.geometry import invert, se3_adjoint
+from bodycap_batch.model.merge_report import Percentiles
 
 _MODES_PER_SOLVE = 48
 """Number of error modes that are propagated at the same time. All modes of eleven cameras together would need
 gigabytes."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SolvedGraph:
-    """A motion graph at its solution. The covariance of the joints is computed from it.
-
-    Attributes:
-        graph: Factors of the graph. The measurements come first, track by track.
-        values: Values of all variables at the solution.
-        body: Bones and hinges of the graph.
-        tick_times_ns: (T,) times of the timeline's ticks.
-        chains: States of each bone, in the order of time.
-        tracks: Measurements of each camera, poses in metres.
-        measured_keys: By camera, the key of the bone's pose at each measurement.
-        mounts: joint_from_cam (4,4) by camera. The solver held the mounts fixed.
-        first_joint: Index of the first joint factor in the graph.
-    """
-
-    graph: Any
-    values: Any
-    body: BodyModel
-    tick_times_ns: IntArray
-    chains: Sequence[Sequence[MotionState]]
-    tracks: Sequence[CameraTrack]
-    measured_keys: Mapping[str, Sequence[int]]
-    mounts: Mapping[str, FloatArray]
-    first_joint: int
-
-
-@dataclass(frozen=True, slots=True)
-class JointUncertainty:
-    """How well the joints of the bones are known.
-
-    Attributes:
-        centre_m2: (T,B,3,3) covariance, m², of each joint's centre relative to the first bone's joint centre,
-            in the axes of the solution.
-        flexion_rad2: (T,B) variance, rad², of the flexion of each hinge, at the bone below it. NaN for bones
-            whose joint is not a hinge.
-    """
-
-    centre_m2: FloatArray
-    flexion_rad2: FloatArray
-
-    def blended(self, later: JointUncertainty, low: int, weight: FloatArray) -> JointUncertainty:
-        """Return this uncertainty, continued by that of a later window.
-
-        Args:
-            later: The uncertainty from the tick `low` on.
-            low: First tick of the later window.
-            weight: (S,) weights of the later window at the ticks that both contain.
-        """
-
-        def join(one: FloatArray, other: FloatArray) -> FloatArray:
-            factor = weight.reshape(-1, *[1] * (one.ndim - 1))
-            both = (1.0 - factor) * one[low:] + factor * other[: len(weight)]
-            return np.concatenate([one[:low], both, other[len(weight) :]])
-
-        return JointUncertainty(
-            join(self.centre_m2, later.centre_m2), join(self.flexion_rad2, later.flexion_rad2)
-        )
-
-
 def joint_covariance(
-    solved: SolvedGraph,
+    graph: MotionGraph,
     world_from_bone: FloatArray,
     error_modes: ErrorModes,
     begin: Callable[[str], None] = lambda _: None,
@@ -101,7 +41,7 @@ def joint_covariance(
     computes J Σ Jᵀ by propagating each error mode to the joints.
 
     Args:
-        solved: The graph at its solution.
+        graph: The solved graph.
         world_from_bone: (T,B,4,4) solved poses of the bones.
         error_modes: Error modes of the calibration.
         begin: Called with the name of each part of the computation before the part starts. It may return
@@ -111,10 +51,9 @@ def joint_covariance(
         The uncertainty; NaN if the equations of the graph are singular.
     """
     begin("joint covariances")
-    linear = linearise(solved.graph, solved.values)
+    linear = linearise(graph.graph, graph.values)
     begin("normal equations")
-    columns = _columns_by_tick(solved, linear)
-    order, bounds = columns.order, columns.bounds
+    order, bounds = _columns_by_tick(graph, linear)
     try:
         normal = BlockTridiagonal.from_sparse((linear.matrix.T @ linear.matrix).tocsr(), order, bounds)
     except np.linalg.LinAlgError:
@@ -122,15 +61,15 @@ def joint_covariance(
         nothing = np.full(world_from_bone.shape[:2], np.nan)
         return JointUncertainty(np.full((*nothing.shape, 3, 3), np.nan), nothing)
     begin("covariances of the measurements")
-    changes = _measurement_residual_jacobian(solved, linear, error_modes)
+    changes = _measurement_residual_jacobian(graph, linear, error_modes)
     changes = changes + joint_residual_jacobian(
-        linear, solved.body, solved.first_joint, world_from_bone, error_modes
+        linear, graph.body, graph.first_joint, world_from_bone, error_modes
     )
     changes = changes.tocsc()
     position = np.argsort(order)
     ticks, count = world_from_bone.shape[:2]
     out = np.zeros((ticks, count, 3, 3))
-    hinges = solved.body.hinges
+    hinges = graph.body.hinges
     flexion = np.full((ticks, count), np.nan)
     lowers = [hinge.lower for hinge in hinges]
     flexion[:, lowers] = 0.0
@@ -181,42 +120,36 @@ def joint_covariance(
     return JointUncertainty(out, flexion)
 
 
-class _TickColumns(NamedTuple):
-    """The columns of the graph's Jacobian in the order of the ticks.
+def _columns_by_tick(graph: MotionGraph, linear: LinearisedGraph) -> tuple[IntArray, IntArray]:
+    """Return the columns of the graph's Jacobian in the order of the ticks.
 
-    Attributes:
-        order: (C,) column indices, tick by tick. A state between two ticks belongs to the earlier tick.
-        bounds: (T+1,) start of each tick's columns in `order`, and C at the end.
+    Returns:
+        (C,) column indices, tick by tick. A state between two ticks belongs to the earlier tick. Then (T+1,)
+        the start of each tick's columns in them, and C at the end.
     """
-
-    order: IntArray
-    bounds: IntArray
-
-
-def _columns_by_tick(solved: SolvedGraph, linear: LinearisedGraph) -> _TickColumns:
     keys, ticks = [], []
-    for chain in solved.chains:
+    for chain in graph.chains:
         times = np.array([state.time_ns for state in chain])
-        tick = np.clip(np.searchsorted(solved.tick_times_ns, times, side="right") - 1, 0, None)
+        tick = np.clip(np.searchsorted(graph.tick_times_ns, times, side="right") - 1, 0, None)
         keys += [key for state in chain for key in (state.pose_key, state.velocity_key)]
         ticks.append(np.repeat(tick, 2))
     tick = np.concatenate(ticks)
     by_tick = np.argsort(tick, kind="stable")
     start = np.array([linear.columns[key] for key in keys], dtype=np.int64)[by_tick]
     order = (start[:, None] + np.arange(6)).ravel()
-    bounds = 6 * np.searchsorted(tick[by_tick], np.arange(len(solved.tick_times_ns) + 1))
-    return _TickColumns(np.asarray(order), np.asarray(bounds, dtype=np.int64))
+    bounds = 6 * np.searchsorted(tick[by_tick], np.arange(len(graph.tick_times_ns) + 1))
+    return np.asarray(order), np.asarray(bounds, dtype=np.int64)
 
 
 def _measurement_residual_jacobian(
-    solved: SolvedGraph, linear: LinearisedGraph, error_modes: ErrorModes
+    graph: MotionGraph, linear: LinearisedGraph, error_modes: ErrorModes
 ) -> Any:
     """Return the sparse change (R,M) of the measurements' residuals for each of the M error modes."""
     out = sparse.csr_matrix((linear.matrix.shape[0], len(error_modes.log_scale)))
-    middle = np.concatenate([track.map_from_cam[:, :3, 3] for track in solved.tracks]).mean(axis=0)
+    middle = np.concatenate([track.map_from_cam[:, :3, 3] for track in graph.tracks]).mean(axis=0)
     first = 0
-    for track in solved.tracks:
-        mount, keys = solved.mounts[track.camera], solved.measured_keys[track.camera]
+    for track in graph.tracks:
+        mount, keys = graph.mounts[track.camera], graph.measured_keys[track.camera]
         factors = first + np.arange(len(keys))
         by_mount = -(se3_adjoint(mount) @ error_modes.mounts[track.camera])
         change = np.repeat(by_mount[None], len(keys), axis=0)
@@ -229,91 +162,38 @@ def _measurement_residual_jacobian(
     return out
 
 
-def flexion_sigma(
-    bones: Sequence[Bone], uncertainty: JointUncertainty | None, joints: int
-) -> FloatArray | None:
-    """Return the sigma (T,J), radians, of the flexion of each hinge of the skeleton.
+def on_skeleton(bones: Sequence[Bone], values: FloatArray, joints: int) -> FloatArray:
+    """Return values (T,B,...) of the graph's bones by joint of the skeleton (T,J,...); NaN for other joints.
 
     Args:
         bones: The graph's bones.
-        uncertainty: How well the joints of the bones are known; None if it was not computed.
+        values: (T,B,...) values of the bones.
         joints: Number J of joints of the skeleton.
-
-    Returns:
-        NaN for joints that are not hinges of the graph; None if `uncertainty` is None.
     """
-    if uncertainty is None:
-        return None
-    out = np.full((len(uncertainty.flexion_rad2), joints), np.nan)
-    out[:, [bone.joint for bone in bones]] = np.sqrt(uncertainty.flexion_rad2)
-    return out
-
-
-def skeleton_covariance(
-    rotation: FloatArray, bones: Sequence[Bone], uncertainty: JointUncertainty | None, joints: int
-) -> FloatArray | None:
-    """Return the covariance of all joints of the skeleton in rotated axes.
-
-    Args:
-        rotation: (3,3) rotation from the old axes to the new axes.
-        bones: The graph's bones.
-        uncertainty: How well the joints of the bones are known; None if it was not computed.
-        joints: Number J of joints of the skeleton.
-
-    Returns:
-        (T,J,3,3) covariances, NaN for joints without a bone in the graph; None if `uncertainty` is None.
-    """
-    if uncertainty is None:
-        return None
-    covariance = uncertainty.centre_m2
-    out = np.full((len(covariance), joints, 3, 3), np.nan)
-    out[:, [bone.joint for bone in bones]] = rotation @ covariance @ rotation.T
+    out = np.full((len(values), joints, *values.shape[2:]), np.nan)
+    out[:, [bone.joint for bone in bones]] = values
     return out
 
 
 def sigma_percentiles(
-    roles: Sequence[str], covariance: FloatArray | None, observed: BoolArray
-) -> dict[str, dict[str, dict[str, float]]]:
-    """Return percentiles of the sigmas of the joints' centres, separately for observed and filled ticks.
-
-    Args:
-        roles: Roles of the J joints.
-        covariance: (T,J,3,3) covariances of the joints' centres, NaN for joints that were not solved; None if
-            they were not computed.
-        observed: (T,J) whether cameras measured each joint at each tick. The other ticks are filled.
-
-    Returns:
-        By role of a joint, then by "observed" or "filled", then by "p50" or "p95": sigma (metres per axis).
-    """
-    if covariance is None:
-        return {}
-    return _percentiles(roles, np.sqrt(np.trace(covariance, axis1=2, axis2=3) / 3.0), observed, digits=5)
-
-
-def flexion_percentiles(
-    roles: Sequence[str], flexion_rad: FloatArray | None, observed: BoolArray
-) -> dict[str, dict[str, dict[str, float]]]:
-    """Return percentiles of the sigmas of the hinges' flexion, separately for observed and filled ticks.
-
-    Args:
-        roles: Roles of the J joints.
-        flexion_rad: (T,J) sigmas, radians, NaN for joints that are no hinges; None if they were not computed.
-        observed: (T,J) whether cameras measured each joint at each tick.
-
-    Returns:
-        By role of a joint, then by "observed" or "filled", then by "p50" or "p95": sigma, degrees.
-    """
-    return {} if flexion_rad is None else _percentiles(roles, np.degrees(flexion_rad), observed, digits=2)
-
-
-def _percentiles(
     roles: Sequence[str], sigma: FloatArray, observed: BoolArray, digits: int
-) -> dict[str, dict[str, dict[str, float]]]:
-    out: dict[str, dict[str, dict[str, float]]] = {}
+) -> dict[str, dict[str, Percentiles]]:
+    """Return percentiles of sigmas, separately for observed and filled ticks.
+
+    Args:
+        roles: Roles of the J joints.
+        sigma: (T,J) sigmas, NaN for joints without one.
+        observed: (T,J) whether cameras measured each joint at each tick. The other ticks are filled.
+        digits: Number of decimals.
+
+    Returns:
+        By role of a joint, then by "observed" or "filled", percentiles of the sigma.
+    """
+    out: dict[str, dict[str, Percentiles]] = {}
     for joint, role in enumerate(roles):
         for name, mask in (("observed", observed[:, joint]), ("filled", ~observed[:, joint])):
             found = sigma[mask & np.isfinite(sigma[:, joint]), joint]
             if role and len(found) and found.any():
-                figures = {f"p{q}": round(float(np.percentile(found, q)), digits) for q in (50, 95)}
-                out.setdefault(role, {})[name] = figures
+                p50, p95 = (round(float(np.percentile(found, q)), digits) for q in (50, 95))
+                out.setdefault(role, {})[name] = Percentiles(p50=p50, p95=p95)
     return out

@@ -93,13 +93,11 @@ def hinge_limits(skeleton: SkeletonModel, bones: Sequence[Bone]) -> tuple[Distan
         side, part = split_side(bones[hinge.upper].role)
         forward = anatomical_axes(skeleton, bones[hinge.upper].role)[:, 1] * (1.0 if part == "Arm" else -1.0)
         joint = hinge.anchors_m.mean(axis=0)
-        length = float(np.linalg.norm(bones[hinge.following].offset_m))
         name = f"{side} {'elbow' if part == 'Arm' else 'knee'} not overstretched"
         # The end of a straight limb has this distance from the point; the end of a bent limb is nearer.
-        straight_m = float(np.hypot(HINGE_ARM_M, length))
         anchor = joint + HINGE_ARM_M * forward
         limits.append(
-            DistanceLimit(name, hinge.upper, hinge.following, anchor, 0.0, straight_m, _HINGE_SIGMA_M)
+            DistanceLimit(name, hinge.upper, hinge.following, anchor, 0.0, hinge.range_m, _HINGE_SIGMA_M)
         )
     return tuple(limits)
 

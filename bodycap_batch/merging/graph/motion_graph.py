@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
@@ -17,8 +17,9 @@ from bodycap_batch.merging.cameras.track import (
     MIN_SIGMA_M,
     MIN_SIGMA_RAD,
     CameraTrack,
+    nearest_times,
 )
-from bodycap_batch.merging.graph.error_modes import BodyModel, ErrorModes
+from bodycap_batch.merging.graph.error_modes import BodyModel
 from bodycap_batch.merging.graph.factors import (
     GEMAN_MCCLURE_C,
     MAX_BONES,
@@ -26,19 +27,16 @@ from bodycap_batch.merging.graph.factors import (
     MotionState,
     bone_key,
     geman_mcclure,
+    poses_from_values,
     velocity_key,
 )
 from bodycap_batch.merging.graph.foot_contact import FootContact
-from bodycap_batch.merging.graph.joint_covariance import JointUncertainty, SolvedGraph, joint_covariance
 from bodycap_batch.merging.graph.joint_distance_limits import DistanceLimit
 from bodycap_batch.merging.graph.motion_prior import add_motion_prior
 from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
-from bodycap_batch.model.geometry import interpolate_pose, invert, so3_log
+from bodycap_batch.model.geometry import interpolate_pose, invert, pose_vectors, so3_log
+from bodycap_batch.model.merge_data import ON_TICK_TOLERANCE_NS
 from bodycap_batch.model.skeleton import SkeletonModel
-
-ON_TICK_TOLERANCE_NS = 1_000_000
-"""Maximum time (nanoseconds) between a measurement and a tick whose state the measurement uses. A measurement
-at a larger distance gets a separate state. In a millisecond, a hand at 3 m/s moves 3 mm."""
 
 _TOLERANCE = 1e-4
 """Minimum relative decrease of the error per step. The solver stops after a smaller decrease. Convergence is
@@ -52,12 +50,45 @@ class MeasurementResiduals:
     Attributes:
         distance_m: (N,) distances between the measured and the solved centres.
         angle_rad: (N,) angles between the measured and the solved orientations.
-        weights: (N,) robust weights of the measurements.
+        weights: (N,) robust weights of the measurements; 1 is the full weight.
     """
 
     distance_m: FloatArray
     angle_rad: FloatArray
     weights: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class JointUncertainty:
+    """How well the joints of the bones are known.
+
+    Attributes:
+        centre_m2: (T,B,3,3) covariance, m², of each joint's centre relative to the first bone's joint centre,
+            in the axes of the solution.
+        flexion_rad2: (T,B) variance, rad², of the flexion of each hinge, at the bone below it. NaN for bones
+            whose joint is not a hinge.
+    """
+
+    centre_m2: FloatArray
+    flexion_rad2: FloatArray
+
+    def blended(self, later: JointUncertainty, low: int, weight: FloatArray) -> JointUncertainty:
+        """Return this uncertainty, continued by that of a later window.
+
+        Args:
+            later: The uncertainty from the tick `low` on.
+            low: First tick of the later window.
+            weight: (S,) weights of the later window at the ticks that both contain.
+        """
+
+        def join(one: FloatArray, other: FloatArray) -> FloatArray:
+            factor = weight.reshape(-1, *[1] * (one.ndim - 1))
+            both = (1.0 - factor) * one[low:] + factor * other[: len(weight)]
+            return np.concatenate([one[:low], both, other[len(weight) :]])
+
+        return JointUncertainty(
+            join(self.centre_m2, later.centre_m2), join(self.flexion_rad2, later.flexion_rad2)
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,9 +97,7 @@ class MotionSolution:
 
     Attributes:
         world_from_bone: (T,B,4,4) pose of each bone at each tick.
-        residual_m: By camera, (N,) distance between each measured centre and the solved centre.
-        residual_rad: By camera, (N,) angle between each measured orientation and the solved orientation.
-        weights: By camera, (N,) robust weight of each measurement; 1 is the full weight.
+        residuals: By camera, the differences between its measured and its solved poses.
         world_from_cam: By camera, (N,4,4) solved pose at each measurement, from bone and mount.
         iterations: Number of iterations of the optimiser.
         errors: By kind of factor, half the sum of the squared residuals.
@@ -76,28 +105,25 @@ class MotionSolution:
     """
 
     world_from_bone: FloatArray
-    residual_m: Mapping[str, FloatArray]
-    residual_rad: Mapping[str, FloatArray]
-    weights: Mapping[str, FloatArray]
+    residuals: Mapping[str, MeasurementResiduals]
     world_from_cam: Mapping[str, FloatArray]
     iterations: int
     errors: Mapping[str, float]
     uncertainty: JointUncertainty | None = None
 
 
-class SolverProgress(Protocol):
-    """Callback that reports the progress of the optimisation. It may raise to stop the optimisation."""
-
-    def __call__(self, what: str = "", /) -> None:
-        """Report the end of an iteration, or the start of a part of the computation.
-
-        Args:
-            what: Name of the part that starts; empty at the end of an iteration.
-        """
-
-
 class MotionGraph:
     """The factor graph of a timeline, or of one window of a timeline.
+
+    Attributes:
+        graph: Factors of the graph: measurements, smoothness, joints, limits.
+        values: Values of all variables at the solution; None before `solve`.
+        body: Bones and hinges of the graph.
+        tick_times_ns: (T,) times of the timeline's ticks.
+        tracks: Measurements of each camera, poses in metres.
+        mounts: joint_from_cam (4,4) by camera. The solver holds the mounts fixed.
+        chains: States of each bone, in the order of time.
+        measured_keys: By camera, the key of the bone's pose at each measurement.
 
     A measurement between ticks gets a separate state in the chain of its bone. GTSAM's
     ``WnoaInterpFactorPose3`` would interpolate without such a state, but it crashes with robust noise.
@@ -120,73 +146,40 @@ class MotionGraph:
         mounts: Mapping[str, FloatArray],
         limits: Sequence[DistanceLimit | FootContact] = (),
     ) -> None:
-        self._skeleton, self._bones, self._times = skeleton, bones, tick_times_ns
-        self._tracks, self._mounts, self._limits = tracks, mounts, limits
-        self._graph = gtsam.NonlinearFactorGraph()
+        self._skeleton, self._bones, self.tick_times_ns = skeleton, bones, tick_times_ns
+        self.tracks, self.mounts, self._limits = tracks, mounts, limits
+        self.body = BodyModel(bones=bones, hinges=hinges(skeleton, tuple(bones)))
+        self.graph = gtsam.NonlinearFactorGraph()
+        self.values: Any = None
         self._factor_counts: dict[str, int] = {}
-        self._measured_keys: dict[str, list[int]] = {}
-        self._chains: list[list[MotionState]] = []
+        self.measured_keys: dict[str, list[int]] = {}
+        self.chains: list[list[MotionState]] = []
         self._add_measurements()
         self._add_motion()
         self._add_joints()
         self._add_limits()
 
     @property
-    def graph(self) -> Any:
-        """Factors of the graph: measurements, smoothness, joints, limits."""
-        return self._graph
+    def first_joint(self) -> int:
+        """Index of the first joint factor in the graph."""
+        return self._factor_counts["measurements"] + self._factor_counts["smoothness"]
 
-    def solve(
-        self, iterations: int, step: SolverProgress, error_modes: ErrorModes | None = None
-    ) -> MotionSolution:
+    def solve(self, iterations: int, step: Callable[[], None]) -> MotionSolution:
         """Optimise the graph.
 
         Args:
             iterations: Maximum number of iterations.
-            step: Called without a name after each iteration, and with the name of each part of the
-                computation before the part starts. It may raise an exception to stop the work.
-            error_modes: Error modes of the calibration. Without them, the covariance of the joints is not
-                computed.
+            step: Called after each iteration. It may raise an exception to stop the work.
         """
-        if error_modes is not None:
-            step("solving")
-        values, count = levenberg_marquardt(
-            self._graph, self.initial_values(), iterations=iterations, step=step, tolerance=_TOLERANCE
+        self.values, count = levenberg_marquardt(
+            self.graph, self.initial_values(), iterations=iterations, step=step, tolerance=_TOLERANCE
         )
-        poses = np.array(
-            [
-                [values.atPose3(bone_key(tick, bone)).matrix() for bone in range(len(self._bones))]
-                for tick in range(len(self._times))
-            ]
-        )
-        solution = self._read(values, poses, count)
-        if error_modes is None:
-            return solution
-        return replace(
-            solution, uncertainty=joint_covariance(self.solved_graph(values), poses, error_modes, step)
-        )
-
-    def solved_graph(self, values: Any) -> SolvedGraph:
-        """Return the graph at a solution, for the computation of the covariance.
-
-        Args:
-            values: Values of all variables at the solution.
-        """
-        return SolvedGraph(
-            graph=self._graph,
-            values=values,
-            body=BodyModel(bones=self._bones, hinges=hinges(self._skeleton, tuple(self._bones))),
-            tick_times_ns=self._times,
-            chains=self._chains,
-            tracks=self._tracks,
-            measured_keys=self._measured_keys,
-            mounts=self._mounts,
-            first_joint=self._factor_counts["measurements"] + self._factor_counts["smoothness"],
-        )
+        poses = poses_from_values(self.values, len(self.tick_times_ns), len(self._bones))
+        return self._read(poses, count)
 
     def _node_keys(self) -> list[dict[int, tuple[int, int]]]:
         """Return for each bone, by tick time, the pose key and the velocity key of the bone's state."""
-        ticks = self._times.tolist()
+        ticks = self.tick_times_ns.tolist()
         return [
             {time: (bone_key(tick, bone), velocity_key(tick, bone)) for tick, time in enumerate(ticks)}
             for bone in range(len(self._bones))
@@ -196,13 +189,15 @@ class MotionGraph:
         nodes = self._node_keys()
         count_off_ticks = [0] * len(self._bones)
         times_off_ticks: list[dict[int, int]] = [{} for _ in self._bones]
-        for track in self._tracks:
+        for track in self.tracks:
             keys = []
-            noises = _measurement_noises(track, self._mounts[track.camera])
-            poses = track.map_from_cam @ invert(self._mounts[track.camera])
-            for time, pose, noise in zip(track.times_ns.tolist(), poses, noises, strict=True):
-                state_time = self._nearest_tick(time)
-                if abs(state_time - time) > ON_TICK_TOLERANCE_NS:
+            noises = _measurement_noises(track, self.mounts[track.camera])
+            poses = track.map_from_cam @ invert(self.mounts[track.camera])
+            ticks = nearest_times(self.tick_times_ns, track.times_ns).tolist()
+            measurements = zip(track.times_ns.tolist(), ticks, poses, noises, strict=True)
+            for time, tick_time, pose, noise in measurements:
+                state_time = tick_time
+                if abs(tick_time - time) > ON_TICK_TOLERANCE_NS:
                     # Measurements of one bone within 1 ms share a state, because two states with almost
                     # equal times make the equations singular.
                     state_time = _merge_state_time(times_off_ticks[track.bone], time)
@@ -214,77 +209,72 @@ class MotionGraph:
                         )
                         count_off_ticks[track.bone] += 1
                 key = nodes[track.bone][state_time][0]
-                self._graph.add(gtsam.PriorFactorPose3(key, gtsam.Pose3(pose), geman_mcclure(noise)))
+                self.graph.add(gtsam.PriorFactorPose3(key, gtsam.Pose3(pose), geman_mcclure(noise)))
                 keys.append(key)
-            self._measured_keys[track.camera] = keys
-        self._chains = [sorted(MotionState(time, *keys) for time, keys in chain.items()) for chain in nodes]
-        self._factor_counts["measurements"] = int(self._graph.size())
-
-    def _nearest_tick(self, time_ns: int) -> int:
-        after = int(np.clip(np.searchsorted(self._times, time_ns), 1, max(len(self._times) - 1, 1)))
-        candidates = self._times[max(after - 1, 0) : after + 1].tolist()
-        return int(min(candidates, key=lambda tick: abs(tick - time_ns)))
+            self.measured_keys[track.camera] = keys
+        self.chains = [sorted(MotionState(time, *keys) for time, keys in chain.items()) for chain in nodes]
+        self._factor_counts["measurements"] = int(self.graph.size())
 
     def _add_motion(self) -> None:
-        before = self._graph.size()
+        before = self.graph.size()
         measured_ns = (
-            min(int(track.times_ns[0]) for track in self._tracks),
-            max(int(track.times_ns[-1]) for track in self._tracks),
+            min(int(track.times_ns[0]) for track in self.tracks),
+            max(int(track.times_ns[-1]) for track in self.tracks),
         )
-        for bone, chain in zip(self._bones, self._chains, strict=True):
-            add_motion_prior(self._graph, bone, chain, start_ns=int(self._times[0]), measured_ns=measured_ns)
-        self._factor_counts["smoothness"] = int(self._graph.size() - before)
+        for bone, chain in zip(self._bones, self.chains, strict=True):
+            add_motion_prior(
+                self.graph, bone, chain, start_ns=int(self.tick_times_ns[0]), measured_ns=measured_ns
+            )
+        self._factor_counts["smoothness"] = int(self.graph.size() - before)
 
     def _add_joints(self) -> None:
-        before = self._graph.size()
-        joints = JointFactors(self._bones, hinges(self._skeleton, tuple(self._bones)))
-        for tick in range(len(self._times)):
-            joints.add(self._graph, tick)
-        self._factor_counts["joints"] = int(self._graph.size() - before)
+        before = self.graph.size()
+        joints = JointFactors(self._bones, self.body.hinges)
+        for tick in range(len(self.tick_times_ns)):
+            joints.add(self.graph, tick)
+        self._factor_counts["joints"] = int(self.graph.size() - before)
 
     def _add_limits(self) -> None:
-        before = self._graph.size()
-        for tick in range(len(self._times)):
+        before = self.graph.size()
+        for tick in range(len(self.tick_times_ns)):
             for limit in self._limits:
-                limit.add(self._graph, tick)
-        self._factor_counts["rules"] = int(self._graph.size() - before)
+                limit.add(self.graph, tick)
+        self._factor_counts["rules"] = int(self.graph.size() - before)
 
     def initial_values(self) -> Any:
         """Return initial values of all states, from the measurements and inverse kinematics."""
         measured = {}
-        for track in reversed(self._tracks):
-            poses, valid = track.poses_at(self._times, max_gap_ns=MAX_COARSE_GAP_NS)
+        for track in reversed(self.tracks):
+            poses, valid = track.poses_at(self.tick_times_ns, max_gap_ns=MAX_COARSE_GAP_NS)
             # If all frames are far apart, no pose is valid. The poses are then interpolated nevertheless.
             filled = fill_gaps(poses, valid) if valid.any() else poses
-            measured[track.bone] = filled @ invert(self._mounts[track.camera])
+            measured[track.bone] = filled @ invert(self.mounts[track.camera])
         poses = pose_bones(self._skeleton, self._bones, measured)
-        tick_s = 1e-9 * (self._times - self._times[0])
+        tick_s = 1e-9 * (self.tick_times_ns - self.tick_times_ns[0])
         values = gtsam.Values()
-        for bone, chain in enumerate(self._chains):
-            state_s = 1e-9 * (np.array([state.time_ns for state in chain]) - self._times[0])
+        for bone, chain in enumerate(self.chains):
+            state_s = 1e-9 * (np.array([state.time_ns for state in chain]) - self.tick_times_ns[0])
             at_states, velocities = _initial_states(poses[:, bone], tick_s, state_s)
             for state, pose, velocity in zip(chain, at_states, velocities, strict=True):
                 values.insert(state.pose_key, gtsam.Pose3(pose))
                 values.insert(state.velocity_key, velocity)
         return values
 
-    def _read(self, values: Any, poses: FloatArray, count: int) -> MotionSolution:
+    def _read(self, poses: FloatArray, count: int) -> MotionSolution:
         residuals, world_from_cam = {}, {}
-        for track in self._tracks:
-            mount = self._mounts[track.camera]
-            keys = self._measured_keys[track.camera]
-            solved = np.array([values.atPose3(key).matrix() for key in keys]).reshape(-1, 4, 4) @ mount
+        for track in self.tracks:
+            mount = self.mounts[track.camera]
+            keys = self.measured_keys[track.camera]
+            solved = np.array([self.values.atPose3(key).matrix() for key in keys]).reshape(-1, 4, 4) @ mount
             world_from_cam[track.camera] = solved
             residuals[track.camera] = measurement_residuals(track, solved)
         errors, first = {}, 0
         for kind, size in self._factor_counts.items():
-            errors[kind] = float(sum(self._graph.at(i).error(values) for i in range(first, first + size)))
+            errors[kind] = float(sum(self.graph.at(i).error(self.values) for i in range(first, first + size)))
             first += size
         return MotionSolution(
             world_from_bone=poses,
-            residual_m={camera: each.distance_m for camera, each in residuals.items()},
-            residual_rad={camera: each.angle_rad for camera, each in residuals.items()},
-            weights={camera: each.weights for camera, each in residuals.items()},
+            residuals=residuals,
             world_from_cam=world_from_cam,
             iterations=count,
             errors=errors,
@@ -300,7 +290,7 @@ def measurement_residuals(track: CameraTrack, world_from_cam: FloatArray) -> Mea
     """
     measured_from_solved = invert(track.map_from_cam) @ world_from_cam
     half = np.linalg.cholesky(camera_covariance(track))
-    whitened = np.linalg.solve(half, _pose_error(measured_from_solved)[..., None])
+    whitened = np.linalg.solve(half, pose_vectors(measured_from_solved)[..., None])
     return MeasurementResiduals(
         distance_m=np.linalg.norm(measured_from_solved[:, :3, 3], axis=1),
         angle_rad=np.linalg.norm(so3_log(measured_from_solved[:, :3, :3]), axis=1),
@@ -341,11 +331,6 @@ def _measurement_noises(track: CameraTrack, joint_from_cam: FloatArray) -> list[
     return [gtsam.noiseModel.Gaussian.Covariance(each) for each in covariance]
 
 
-def _pose_error(pose: FloatArray) -> FloatArray:
-    """Return rotation vectors and translations (N,6) of poses (N,4,4) near the identity."""
-    return np.hstack([so3_log(pose[:, :3, :3]), pose[:, :3, 3]])
-
-
 def _geman_mcclure_weight(norm: FloatArray) -> FloatArray:
     """Return the robust weights of residuals with the given norms in sigmas."""
     squared = GEMAN_MCCLURE_C**2
@@ -372,7 +357,7 @@ def _initial_states(
     span = tick_s[first + 1] - tick_s[first]
     alpha = np.clip((state_s - tick_s[first]) / span, 0.0, 1.0)
     step = invert(poses[first]) @ poses[first + 1]
-    return interpolate_pose(poses[first], poses[first + 1], alpha), _pose_error(step) / span[:, None]
+    return interpolate_pose(poses[first], poses[first + 1], alpha), pose_vectors(step) / span[:, None]
 
 
 def joint_gaps(bones: Sequence[Bone], world_from_bone: FloatArray) -> dict[str, FloatArray]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
+from bodycap_batch.merging.body.trunk_lean import MAX_SAMPLES
 from bodycap_batch.merging.cameras.track import CameraTrack
 
 MIN_WALKING_SPEED_M_PER_S = 0.5
@@ -49,8 +50,6 @@ _STEP_M = 0.7
 """Length (metres) of a path over which the height of a walking trunk varies once. Derivation: a step."""
 _FIT_ITERATIONS = 15
 """Number of iterations of the robust fit of a path's plane. Evidence: none."""
-_MAX_SAMPLES = 300
-"""Maximum number of instants at which the speed is evaluated. It bounds the computing time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,7 +128,7 @@ def is_mostly_walking(track: CameraTrack) -> bool:
     Args:
         track: Track of the trunk's camera in metres.
     """
-    times_ns = track.times_ns[evenly_spaced(len(track.times_ns), _MAX_SAMPLES)]
+    times_ns = track.times_ns[evenly_spaced(len(track.times_ns), MAX_SAMPLES)]
     half_step = _STEP_NS // 2
     before, after = (track.poses_at(times_ns + sign * half_step, max_gap_ns=_STEP_NS) for sign in (-1, 1))
     speed = np.linalg.norm((after[0] - before[0])[:, :3, 3], axis=1) / (1e-9 * _STEP_NS)

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.cameras.track import MAX_SAMPLE_GAP_NS, CameraTrack
 from bodycap_batch.merging.graph.error_modes import ErrorModes
-from bodycap_batch.merging.graph.joint_covariance import JointUncertainty
+from bodycap_batch.merging.graph.joint_covariance import joint_covariance
 from bodycap_batch.merging.graph.motion_graph import (
     MotionGraph,
     MotionSolution,
-    SolverProgress,
     measurement_residuals,
 )
 from bodycap_batch.model.geometry import interpolate_pose
@@ -47,19 +47,15 @@ MAX_ITERATIONS = 20
 """Maximum number of iterations of the optimiser for one window. Evidence: none."""
 
 
-@dataclass(frozen=True, slots=True)
-class WindowSolution:
-    """The solution of one window.
+class SolverProgress(Protocol):
+    """Callback that reports the progress of the optimisation. It may raise to stop the optimisation."""
 
-    Attributes:
-        solution: Solution of the window with its overlaps.
-        first: Index, on the timeline, of the window's first tick without its overlaps.
-        low: Index, on the timeline, of the window's first tick with its overlaps. The solution starts there.
-    """
+    def __call__(self, what: str = "", /) -> None:
+        """Report the end of an iteration, or the start of a part of the computation.
 
-    solution: MotionSolution
-    first: int
-    low: int
+        Args:
+            what: Name of the part that starts; empty at the end of an iteration.
+        """
 
 
 def solve_windows(
@@ -84,14 +80,20 @@ def solve_windows(
         error_modes: Error modes of the calibration. Without them, the covariance of the joints is not
             computed.
     """
-    parts: list[WindowSolution] = []
+    parts: list[tuple[MotionSolution, int, int]] = []
     for first, last in split_timeline(tick_times_ns, tracks, window_ticks):
         low, high = with_overlap(tick_times_ns, first, last)
         clipped = [_clip_track(track, tick_times_ns, low, high) for track in tracks]
         measured = [track for track in clipped if len(track.times_ns)]
-        solution = build(tick_times_ns[low:high], measured).solve(MAX_ITERATIONS, step, error_modes)
-        parts.append(WindowSolution(solution, first, low))
-    return parts[0].solution if len(parts) == 1 else _blend_windows(parts, tick_times_ns, tracks)
+        graph = build(tick_times_ns[low:high], measured)
+        if error_modes is not None:
+            step("solving")
+        solution = graph.solve(MAX_ITERATIONS, step)
+        if error_modes is not None:
+            uncertainty = joint_covariance(graph, solution.world_from_bone, error_modes, step)
+            solution = replace(solution, uncertainty=uncertainty)
+        parts.append((solution, first, low))
+    return parts[0][0] if len(parts) == 1 else _blend_windows(parts, tick_times_ns, tracks)
 
 
 def with_overlap(tick_times_ns: IntArray, first: int, last: int) -> tuple[int, int]:
@@ -215,15 +217,23 @@ def _blend_weight(times_ns: IntArray, boundary_ns: int) -> FloatArray:
 
 
 def _blend_windows(
-    parts: Sequence[WindowSolution], tick_times_ns: IntArray, tracks: Sequence[CameraTrack]
+    parts: Sequence[tuple[MotionSolution, int, int]],
+    tick_times_ns: IntArray,
+    tracks: Sequence[CameraTrack],
 ) -> MotionSolution:
-    """Join the solutions of the windows. Near each boundary, blend from one solution to the next."""
-    start = parts[0].solution
+    """Join the solutions of the windows. Near each boundary, blend from one solution to the next.
+
+    Args:
+        parts: For each window, its solution with the overlaps, its first tick without the overlaps, and the
+            tick at which the solution starts.
+        tick_times_ns: (T,) times of the timeline's ticks.
+        tracks: Tracks of all cameras on the whole timeline.
+    """
+    start = parts[0][0]
     poses, uncertainty = start.world_from_bone, start.uncertainty
     cameras = {track.camera: np.zeros((0, 4, 4)) for track in tracks} | dict(start.world_from_cam)
-    for part in parts[1:]:
-        solution, low = part.solution, part.low
-        boundary_ns = int(tick_times_ns[part.first])
+    for solution, first, low in parts[1:]:
+        boundary_ns = int(tick_times_ns[first])
         weight = _blend_weight(tick_times_ns[low : len(poses)], boundary_ns)
         poses = _blend_poses(poses, solution.world_from_bone, weight)
         if uncertainty is not None and solution.uncertainty is not None:
@@ -234,7 +244,14 @@ def _blend_windows(
             if after is not None:
                 times = track.times_ns[np.searchsorted(track.times_ns, from_ns) : len(before)]
                 cameras[track.camera] = _blend_poses(before, after, _blend_weight(times, boundary_ns))
-    return _assemble(parts, tracks, poses, uncertainty, cameras)
+    return MotionSolution(
+        world_from_bone=poses,
+        residuals={track.camera: measurement_residuals(track, cameras[track.camera]) for track in tracks},
+        world_from_cam=cameras,
+        iterations=max(solution.iterations for solution, *_ in parts),
+        errors={kind: sum(solution.errors[kind] for solution, *_ in parts) for kind in start.errors},
+        uncertainty=uncertainty,
+    )
 
 
 def _blend_poses(before: FloatArray, after: FloatArray, weight: FloatArray) -> FloatArray:
@@ -250,28 +267,3 @@ def _blend_poses(before: FloatArray, after: FloatArray, weight: FloatArray) -> F
     alpha = weight.reshape(-1, *[1] * (before.ndim - 3))
     blended = interpolate_pose(before[len(before) - overlap :], after[:overlap], alpha)
     return np.concatenate([before[: len(before) - overlap], blended, after[overlap:]])
-
-
-def _assemble(
-    parts: Sequence[WindowSolution],
-    tracks: Sequence[CameraTrack],
-    poses: FloatArray,
-    uncertainty: JointUncertainty | None,
-    cameras: dict[str, FloatArray],
-) -> MotionSolution:
-    """Make one solution from the blended poses, and compute the residuals of the measurements."""
-    errors: dict[str, float] = {}
-    for part in parts:
-        for kind, error in part.solution.errors.items():
-            errors[kind] = errors.get(kind, 0.0) + error
-    residuals = {track.camera: measurement_residuals(track, cameras[track.camera]) for track in tracks}
-    return MotionSolution(
-        world_from_bone=poses,
-        residual_m={camera: each.distance_m for camera, each in residuals.items()},
-        residual_rad={camera: each.angle_rad for camera, each in residuals.items()},
-        weights={camera: each.weights for camera, each in residuals.items()},
-        world_from_cam=cameras,
-        iterations=max(part.solution.iterations for part in parts),
-        errors=errors,
-        uncertainty=uncertainty,
-    )

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -22,8 +21,13 @@ from bodycap_batch.merging.body_calibration.calibrate_body import (
     reference_camera_roll,
     with_rolls,
 )
+from bodycap_batch.merging.body_calibration.calibration_covariance import PoseSigma
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import take_samples
+from bodycap_batch.merging.body_calibration.stated_constraints import (
+    StatedConstraints,
+    stated_constraints,
+)
 from bodycap_batch.merging.cameras.track import CameraTrack, make_track, transform_track, transform_trajectory
 from bodycap_batch.merging.cameras.track_outliers import remove_outliers
 from bodycap_batch.merging.map_alignment.initial_alignment import (
@@ -31,12 +35,8 @@ from bodycap_batch.merging.map_alignment.initial_alignment import (
     align_maps_initially,
     require_common_time,
 )
-from bodycap_batch.merging.map_alignment.scale_sources import (
-    StatedConstraints,
-    scale_from_walked_floor,
-    stated_constraints,
-)
-from bodycap_batch.merging.map_alignment.similarity_refinement import AlignmentSigma, MapAlignmentProblem
+from bodycap_batch.merging.map_alignment.similarity_refinement import MapAlignmentProblem
+from bodycap_batch.merging.map_alignment.walked_floor import MAX_SAMPLES, scale_from_walked_floor
 from bodycap_batch.merging.world.vertical import Vertical
 from bodycap_batch.model.geometry import Similarity
 from bodycap_batch.model.merge_data import MergeInputs
@@ -45,9 +45,6 @@ from bodycap_batch.model.scene import Trajectory
 MAX_SIGMA_M = 0.06
 """Maximum sigma (metres per axis) of the positions of a further map's cameras. A map with a larger sigma is
 not used. Evidence: none."""
-_MAX_SAMPLES = 240
-"""Maximum number of instants at which the cameras are sampled. It bounds the computing time. Evidence:
-none."""
 _REACH_SIGMA = 0.05
 """Sigma of the logarithm of the scale that follows from the limbs' reach. The sigma allows for the elbows of
 a walking person, which keep 15 to 30 degrees of flexion. The limbs' reach is used as a source of the scale,
@@ -72,18 +69,14 @@ class AlignedMap:
 
     Attributes:
         gauge: Gauge of the further map.
-        cameras: Names of the further map's cameras.
         main_from_gauge: Similarity from the further map to the main map.
-        sigma_rad: Sigma of the map's rotation per axis, radians.
-        sigma_m: Sigma of the positions of the map's cameras per axis, metres.
+        sigma: Sigmas of the map's rotation, and of the positions of the map's cameras.
         reason: Reason why the map is not used; None if it is used.
     """
 
     gauge: str
-    cameras: tuple[str, ...]
     main_from_gauge: Similarity
-    sigma_rad: float
-    sigma_m: float
+    sigma: PoseSigma
     reason: str | None
 
 
@@ -100,18 +93,8 @@ class UsableCameras:
 
     trajectories: tuple[Trajectory, ...]
     main_from_gauge: Mapping[str, Similarity]
-    sigmas: Mapping[str, AlignmentSigma]
+    sigmas: Mapping[str, PoseSigma]
     unused: Mapping[str, str]
-
-    def report(self) -> dict[str, Any]:
-        """Return the sigmas of each aligned camera as plain JSON values."""
-        return {
-            camera: {
-                "sigma_deg": round(float(np.degrees(sigma.rotation_rad)), 3),
-                "sigma_m": round(sigma.position_m, 5),
-            }
-            for camera, sigma in self.sigmas.items()
-        }
 
 
 def align_cameras(
@@ -133,11 +116,6 @@ def align_cameras(
     Returns:
         The cameras of the main map and of the aligned maps, and the reasons why other cameras are not used.
     """
-    identity = Similarity(1.0, np.eye(3), np.zeros(3))
-    if not further:
-        return UsableCameras(
-            trajectories=tuple(main), main_from_gauge={main[0].gauge: identity}, sigmas={}, unused={}
-        )
     bones = kinematic_chain(
         inputs.skeleton, {inputs.mount_of(each.camera).role for each in (*main, *further)}
     )
@@ -146,7 +124,8 @@ def align_cameras(
     for each in (*main, *further):
         track = make_track(inputs, each, index[inputs.mount_of(each.camera).role])
         tracks.setdefault(each.gauge, []).append(track)
-    found, unused = _align_all(inputs, options or MergeOptions(), bones, tracks, step)
+    found, failed = _align_all(inputs, options or MergeOptions(), bones, tracks, step)
+    failed |= {item.gauge: item.reason for item in found if item.reason is not None}
     aligned = {item.gauge: item for item in found if item.reason is None}
     transformed = [
         transform_trajectory(each, aligned[each.gauge].main_from_gauge, main[0].gauge)
@@ -155,19 +134,16 @@ def align_cameras(
     ]
     return UsableCameras(
         trajectories=(*main, *transformed),
-        main_from_gauge={main[0].gauge: identity}
-        | {gauge: item.main_from_gauge for gauge, item in aligned.items()},
-        sigmas={
-            camera: AlignmentSigma(item.sigma_rad, item.sigma_m)
-            for item in aligned.values()
-            for camera in item.cameras
+        main_from_gauge={
+            main[0].gauge: Similarity(1.0, np.eye(3), np.zeros(3)),
+            **{gauge: item.main_from_gauge for gauge, item in aligned.items()},
         },
-        unused=unused
-        | {
-            camera: _exclusion_reason(item.gauge, main[0].camera, main[0].gauge, item.reason)
-            for item in found
-            if item.reason is not None
-            for camera in item.cameras
+        sigmas={track.camera: item.sigma for gauge, item in aligned.items() for track in tracks[gauge]},
+        unused={
+            track.camera: f"the map of this camera ({gauge}) has no place in common with the map of "
+            f"{main[0].camera} ({main[0].gauge}), and the body's movement could not align the two maps: {why}"
+            for gauge, why in failed.items()
+            for track in tracks[gauge]
         },
     )
 
@@ -176,7 +152,7 @@ def _align_all(
     inputs: MergeInputs,
     options: MergeOptions,
     bones: Sequence[Bone],
-    tracks: dict[str, list[CameraTrack]],
+    tracks: Mapping[str, Sequence[CameraTrack]],
     step: Callable[[], None],
 ) -> tuple[tuple[AlignedMap, ...], dict[str, str]]:
     """Align all further maps together. If this fails, align each further map separately.
@@ -185,66 +161,36 @@ def _align_all(
         inputs: The inputs of the merge stage.
         options: Options of the merge stage. Only ``known_distance`` and ``marker_board`` are used.
         bones: The graph's bones, for all cameras.
-        tracks: By gauge, the tracks of each map. The main map is first, with the trunk's camera first. The
-            function removes maps that it cannot align.
+        tracks: By gauge, the tracks of each map. The main map is first, with the trunk's camera first.
         step: Function that is called after each iteration. It may raise an exception to stop the work.
 
     Returns:
-        The aligned maps. Also, for each camera whose map could not be aligned, the reason by camera name.
+        The aligned maps. Also, by gauge of each map that could not be aligned, the reason.
     """
     (main, (trunk, *_)), *others = tracks.items()
-    unused: dict[str, str] = {}
-
-    def exclude(gauge: str, why: str) -> None:
-        for track in tracks.pop(gauge):
-            unused[track.camera] = _exclusion_reason(gauge, trunk.camera, main, why)
-
+    failed: dict[str, str] = {}
     for gauge, group in others:
         try:
             require_common_time(trunk, group)
         except EstimationError as error:
-            exclude(gauge, error.message)
-    if len(tracks) == 1:
-        return (), unused
+            failed[gauge] = error.message
+    rest = {gauge: group for gauge, group in others if gauge not in failed}
+    if not rest:
+        return (), failed
     try:
-        return align_maps(inputs, options, bones, tracks, step), unused
+        return align_maps(inputs, options, bones, {main: tracks[main], **rest}, step), failed
     except EstimationError as error:
-        if len(tracks) == 2:
-            exclude(next(name for name in tracks if name != main), error.message)
-            return (), unused
+        if len(rest) == 1:
+            return (), {**failed, **dict.fromkeys(rest, error.message)}
     # A single map that does not fit the body makes the alignment of all maps fail. Each map is therefore
     # aligned separately.
     found: tuple[AlignedMap, ...] = ()
-    for gauge in [name for name in tracks if name != main]:
+    for gauge, group in rest.items():
         try:
-            found += align_maps(inputs, options, bones, {main: tracks[main], gauge: tracks[gauge]}, step)
+            found += align_maps(inputs, options, bones, {main: tracks[main], gauge: group}, step)
         except EstimationError as error:
-            exclude(gauge, error.message)
-    return found, unused
-
-
-def _exclusion_reason(gauge: str, trunk_camera: str, main_gauge: str, why: str) -> str:
-    """Return the message for a camera whose map could not be aligned with the trunk's map."""
-    return (
-        f"the map of this camera ({gauge}) has no place in common with the map of {trunk_camera} "
-        f"({main_gauge}), and the body's movement could not align the two maps: {why}"
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class _Start:
-    """The initial values for the refinement of the alignment.
-
-    Attributes:
-        inputs: The inputs of the merge stage. The mount prior of the trunk's camera is rotated by the
-            estimated roll of this camera.
-        alignment: Initial similarities and scale.
-        up: The vertical in the main map; None if it is unknown.
-    """
-
-    inputs: MergeInputs
-    alignment: InitialAlignment
-    up: Vertical | None
+            failed[gauge] = error.message
+    return found, failed
 
 
 def _initialise(
@@ -253,8 +199,13 @@ def _initialise(
     main: Sequence[CameraTrack],
     others: Sequence[tuple[str, Sequence[CameraTrack]]],
     stated: StatedConstraints,
-) -> _Start:
-    """Estimate the roll of the trunk's camera and the initial alignment."""
+) -> tuple[MergeInputs, InitialAlignment, Vertical | None]:
+    """Estimate the roll of the trunk's camera and the initial alignment.
+
+    Returns:
+        The inputs with the mount prior of the trunk's camera rotated by this roll, the initial similarities
+        and scale, and the vertical in the main map; None if it is unknown.
+    """
     alignment = align_maps_initially(bones, main, others, {mount.camera: mount for mount in inputs.mounts})
     own = _without_outliers(inputs, main, alignment.metres_per_unit)
     roll, up = reference_camera_roll(inputs, bones, own, alignment.metres_per_unit, stated.verticals)
@@ -262,22 +213,7 @@ def _initialise(
         inputs = with_rolls(inputs, {main[0].camera: roll})
         mounts = {mount.camera: mount for mount in inputs.mounts}
         alignment = align_maps_initially(bones, main, others, mounts)
-    return _Start(inputs, alignment, up)
-
-
-def _require_one_scale(strain: float, reach_sigma: float) -> None:
-    """Raise an EstimationError if the scale from the limbs' reach and the solved scale contradict each other.
-
-    Args:
-        strain: Absolute difference of the two log scales, in sigmas.
-        reach_sigma: Sigma of the log scale from the limbs' reach.
-    """
-    if strain > _MAX_STRAIN:
-        raise EstimationError(
-            "the scale from the length of the limbs and the scale from the movement of the cameras differ "
-            f"by {100 * strain * reach_sigma:.0f} %",
-            hint="record a longer walk with turns",
-        )
+    return inputs, alignment, up
 
 
 def _without_outliers(inputs: MergeInputs, tracks: Sequence[CameraTrack], scale: float) -> list[CameraTrack]:
@@ -308,9 +244,11 @@ def align_maps(
             different cameras were localised at the same time.
     """
     (main_gauge, main), *others = tracks.items()
-    stated = stated_constraints(inputs, options, main_gauge)
-    start = _initialise(inputs, bones, main, others, stated)
-    inputs, alignment, up = start.inputs, start.alignment, start.up
+    # A distance or a board in another map causes an error here. After all maps are aligned, the calibration
+    # uses both again and reports the remaining errors.
+    own_map = {main_gauge: Similarity(1.0, np.eye(3), np.zeros(3))}
+    stated = stated_constraints(inputs, options, own_map, skip_unusable=True)
+    inputs, alignment, up = _initialise(inputs, bones, main, others, stated)
     mounts = {mount.camera: mount for mount in inputs.mounts}
     initial, provisional = alignment.main_from_gauge, alignment.metres_per_unit
     together = [
@@ -318,23 +256,29 @@ def align_maps(
         *(transform_track(track, initial[gauge]) for gauge, group in others for track in group),
     ]
     together = _without_outliers(inputs, together, provisional)
-    samples = take_samples(together, provisional, _MAX_SAMPLES, None if up is None else up.up)
+    samples = take_samples(together, provisional, MAX_SAMPLES, None if up is None else up.up)
     calibration = CalibrationGraph(inputs.skeleton, bones, samples, mounts, provisional, step)
-    names = {gauge: tuple(track.camera for track in group) for gauge, group in others}
+    cameras = [tuple(track.camera for track in group) for _, group in others]
     observable_sigma = _REACH_SIGMA if alignment.one_map_spans_a_limb else _SEPARATE_MAPS_SIGMA
     reach_sigma = observable_sigma if alignment.scale_observable else _UNOBSERVABLE_SIGMA
     problem = MapAlignmentProblem(
-        calibration, list(names.values()), provisional, reach_sigma=reach_sigma, stated=stated.scales
+        calibration, cameras, provisional, reach_sigma=reach_sigma, stated=stated.scales
     )
     problem.solve()
     # A scale that the job gives may contradict the limbs' reach. Only other scales must agree with the reach.
     if not stated.scales:
-        _require_one_scale(abs(problem.scale_residual()), reach_sigma)
+        strain = abs(problem.scale_residual())
+        if strain > _MAX_STRAIN:
+            raise EstimationError(
+                "the scale from the length of the limbs and the scale from the movement of the cameras "
+                f"differ by {100 * strain * reach_sigma:.0f} %",
+                hint="record a longer walk with turns",
+            )
         points = map_points_of(inputs, together[0].camera)
         floor = scale_from_walked_floor(inputs, together[0], up, problem.scale(), points)
         problem.add_scale_sources(() if floor is None else (floor,))
     out = []
-    for index, (gauge, cameras) in enumerate(names.items()):
+    for index, (gauge, _) in enumerate(others):
         sigma = problem.sigmas(index)
         why = None
         if not sigma.position_m <= MAX_SIGMA_M:
@@ -347,10 +291,8 @@ def align_maps(
         out.append(
             AlignedMap(
                 gauge=gauge,
-                cameras=cameras,
                 main_from_gauge=problem.corrections[index].after(initial[gauge]),
-                sigma_rad=sigma.rotation_rad,
-                sigma_m=sigma.position_m,
+                sigma=sigma,
                 reason=why,
             )
         )

@@ -9,8 +9,9 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body.bones import LIMB_CHAINS, Bone
+from bodycap_batch.merging.body.bones import LIMB_CHAINS, Bone, bones_to_root
 from bodycap_batch.merging.body.provisional_scale import (
+    MIN_COMMON_FRAMES,
     distance_constraint,
     kinematic_neighbours,
     provisional_scale,
@@ -37,8 +38,6 @@ _MIN_COMMON_S = 4.0
 path does not determine the alignment."""
 _MIN_INSTANTS = 3
 """Minimum number of points of the shared path. Three points determine a rotation."""
-_MIN_COMMON_FRAMES = 10
-"""Minimum number of frames in which both cameras are localised at the same time. Evidence: none."""
 _MAX_SCALE_SIGMA = 0.25
 """Maximum sigma of the log of an observable scale. A scale with a larger sigma is treated as not observable.
 The sigma comes from the uncertainty of the mounts. Evidence: docs/decisions/merging.md."""
@@ -89,8 +88,8 @@ def align_maps_initially(
         EstimationError: Nothing determines the scale, or the cameras' distances are impossible for a person.
     """
     groups = [main, *(group for _, group in others)]
-    information = _scale_information(bones, groups, mounts)
-    ignored = information.uninformative if np.isfinite(information.sigma_log) else ()
+    uninformative, sigma_log = _scale_information(bones, groups, mounts)
+    ignored = uninformative if np.isfinite(sigma_log) else ()
     metres_per_unit, similarities = np.inf, {}
     for _ in range(_ITERATIONS):
         similarities = {
@@ -101,7 +100,7 @@ def align_maps_initially(
     return InitialAlignment(
         main_from_gauge=similarities,
         metres_per_unit=metres_per_unit,
-        scale_observable=bool(information.sigma_log <= _MAX_SCALE_SIGMA),
+        scale_observable=bool(sigma_log <= _MAX_SCALE_SIGMA),
         one_map_spans_a_limb=_one_map_spans_a_limb(bones, groups),
     )
 
@@ -119,29 +118,19 @@ def _one_map_spans_a_limb(bones: Sequence[Bone], groups: Sequence[Sequence[Camer
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _ScaleInformation:
-    """Information about the scale from the distances between cameras.
-
-    Attributes:
-        uninformative: Names of cameras whose distance from a kinematic neighbour in another map contains no
-            information about the scale.
-        sigma_log: Sigma of the scale's logarithm from the distances of the other cameras; infinite without
-            such distances.
-    """
-
-    uninformative: set[str]
-    sigma_log: float
-
-
 def _scale_information(
     bones: Sequence[Bone], groups: Sequence[Sequence[CameraTrack]], mounts: Mapping[str, Mount]
-) -> _ScaleInformation:
+) -> tuple[set[str], float]:
     """Return how well the distances between cameras determine the scale.
 
     A distance between cameras in different maps contains information only if one camera is on a limb bone,
     and if this bone swings about a joint of the other camera's bone. The amount of information depends on the
     distance between the two cameras, and on the uncertainty of their mounts.
+
+    Returns:
+        Names of cameras whose distance from a kinematic neighbour in another map contains no information
+        about the scale. Then the sigma of the scale's logarithm from the distances of the other cameras;
+        infinite without such distances.
 
     Raises:
         EstimationError: No distance contains information, and a camera that hardly swings is in a separate
@@ -168,7 +157,7 @@ def _scale_information(
             hint="wear a camera on an upper arm, or let two cameras film the same places, so that both "
             "cameras are in one map",
         )
-    return _ScaleInformation(uninformative, 1.0 / np.sqrt(information) if information else np.inf)
+    return uninformative, 1.0 / float(np.sqrt(information)) if information else np.inf
 
 
 def align_map(
@@ -229,7 +218,7 @@ def require_common_time(main: CameraTrack, group: Sequence[CameraTrack]) -> None
         both_known = main_known & np.isfinite(_smoothed_path(track, at_ns)[:, 0])
         valid = track.poses_at(main.times_ns, max_gap_ns=MAX_SAMPLE_GAP_NS)[1]
         long = inside.any() and np.ptp(main.times_ns[inside]) * 1e-9 >= _MIN_COMMON_S
-        if long and both_known.sum() >= _MIN_INSTANTS and valid.sum() >= _MIN_COMMON_FRAMES:
+        if long and both_known.sum() >= _MIN_INSTANTS and valid.sum() >= MIN_COMMON_FRAMES:
             return
     raise EstimationError(
         f"the cameras {group[0].camera!r} and {main.camera!r} were localised at the same time for less "
@@ -260,8 +249,7 @@ def _smoothed_path(track: CameraTrack, at_ns: IntArray) -> FloatArray:
 
 def _rest_pose(bones: Sequence[Bone], mount: Mount, bone: int) -> FloatArray:
     """Return the pose (4,4) of a camera in the first bone's frame, with the body in the rest pose."""
-    pose, current = np.array(mount.joint_from_cam), bone
-    while bones[current].parent >= 0:
-        pose = make_transform(bones[current].mean_rotation, bones[current].offset_m) @ pose
-        current = bones[current].parent
+    pose = np.array(mount.joint_from_cam)
+    for index in bones_to_root(bones, bone)[:-1]:
+        pose = make_transform(bones[index].mean_rotation, bones[index].offset_m) @ pose
     return pose

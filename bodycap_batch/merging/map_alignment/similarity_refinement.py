@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import EstimationError
-from bodycap_batch.merging.body_calibration.calibration_covariance import measurement_jacobian, scale_jacobian
+from bodycap_batch.merging.body_calibration.calibration_covariance import (
+    PoseSigma,
+    measurement_jacobian,
+    scale_jacobian,
+)
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.mount_covariance import LinearisedCalibration
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
@@ -24,31 +27,6 @@ _MAX_STEPS = 8
 _CONVERGED = 1e-3
 """Minimum relative change of the cost per step. A step with a smaller change is the last step. Evidence:
 none."""
-
-
-class AlignmentSigma(NamedTuple):
-    """The uncertainty of a map's alignment.
-
-    Attributes:
-        rotation_rad: Sigma of the map's rotation per axis, radians.
-        position_m: Sigma of the positions of the map's cameras per axis, metres.
-    """
-
-    rotation_rad: float
-    position_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class _Step:
-    """A Gauss-Newton step for G further maps.
-
-    Attributes:
-        change: (1 + 7 G,) change of the log scale, and of each map's rotation, log scale and translation.
-        covariance: (1 + 7 G, 1 + 7 G) covariance of `change`.
-    """
-
-    change: FloatArray
-    covariance: FloatArray
 
 
 class MapAlignmentProblem:
@@ -91,7 +69,7 @@ class MapAlignmentProblem:
             self._descend()
         self._calibration.leave_out_map_errors()
         self._descend()
-        self._covariance = self._step(0.0).covariance
+        _, self._covariance = self._step(0.0)
 
     def scale(self) -> ScaleSource:
         """Return the solved scale of the main map."""
@@ -103,21 +81,20 @@ class MapAlignmentProblem:
         if sources:
             self._sources += tuple(sources)
             self._descend()
-            self._covariance = self._step(0.0).covariance
+            _, self._covariance = self._step(0.0)
 
     def _descend(self) -> None:
         """Take damped steps until the cost hardly changes."""
         cost = self._cost()
         damping = 1e-4
         for _ in range(_MAX_STEPS):
-            change = self._step(damping).change
+            change, _ = self._step(damping)
             before = self._calibration.samples, self._scale, list(self.corrections)
             self._apply(change)
             trial = self._cost()
             converged = abs(trial - cost) < _CONVERGED * max(cost, 1.0)
             if trial > cost:
-                self._calibration.set_samples(before[0])
-                _, self._scale, self.corrections = before
+                self._calibration.samples, self._scale, self.corrections = before
                 self._calibration.solve(self._scale)
                 damping = max(100.0 * damping, 1e-2)
             else:
@@ -125,7 +102,7 @@ class MapAlignmentProblem:
             if converged:
                 break
 
-    def sigmas(self, index: int) -> AlignmentSigma:
+    def sigmas(self, index: int) -> PoseSigma:
         """Return the sigmas of a map's rotation and of the sampled positions of this map's cameras.
 
         Args:
@@ -139,7 +116,7 @@ class MapAlignmentProblem:
         by_rotation = np.cross(modes[None, :3].swapaxes(1, 2), off.swapaxes(1, 2)).swapaxes(1, 2)
         shifts = by_rotation + off * modes[None, 3:4] + modes[None, 4:]
         position = (shifts**2).sum(axis=(1, 2)).mean()
-        return AlignmentSigma(float(np.sqrt((modes[:3] ** 2).sum() / 3.0)), float(np.sqrt(position / 3.0)))
+        return PoseSigma(float(np.sqrt((modes[:3] ** 2).sum() / 3.0)), float(np.sqrt(position / 3.0)))
 
     def _centres(self, index: int) -> tuple[FloatArray, FloatArray]:
         """Return the sampled centres (N,3) of a further map's cameras, metres, and their mean (3,)."""
@@ -147,11 +124,15 @@ class MapAlignmentProblem:
         centres = self._scale * samples.map_from_cam[members][samples.valid[members], :3, 3]
         return centres, centres.mean(axis=0)
 
-    def _step(self, damping: float) -> _Step:
+    def _step(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """Return the Gauss-Newton step that lowers the cost, with its covariance.
 
         Args:
             damping: Relative increase of the diagonal of the normal equations.
+
+        Returns:
+            For G further maps, (1 + 7 G,) change of the log scale, and of each map's rotation, log scale and
+            translation. Then (1 + 7 G, 1 + 7 G) the covariance of this change.
         """
         mounts, derivatives = self._linearised()
         solved = mounts.reduced(derivatives)
@@ -169,7 +150,7 @@ class MapAlignmentProblem:
         free = np.arange(len(normal) - count, len(normal))
         normal[free, free] *= 1.0 + damping
         change = _solve_normal_equations(normal, influence.T @ rhs)[-count:]
-        return _Step(np.asarray(change, dtype=np.float64), np.asarray(covariance[-count:, -count:]))
+        return np.asarray(change, dtype=np.float64), np.asarray(covariance[-count:, -count:])
 
     def _linearised(self) -> tuple[LinearisedCalibration, FloatArray]:
         """Linearise the calibration.
@@ -235,7 +216,7 @@ class MapAlignmentProblem:
             update = Similarity(factor, rotation, middle + shift / self._scale - factor * rotation @ middle)
             poses[members] = update.apply_to_poses(poses[members])
             self.corrections[index] = update.after(self.corrections[index])
-        self._calibration.set_samples(replace(samples, map_from_cam=poses))
+        self._calibration.samples = replace(samples, map_from_cam=poses)
         self._scale *= float(np.exp(change[0]))
 
 

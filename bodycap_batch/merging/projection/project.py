@@ -24,20 +24,14 @@ from bodycap_batch.merging.projection.rigid_motion_solver import (
 )
 from bodycap_batch.model.camera_clock import CameraClock
 from bodycap_batch.model.geometry import invert, poses_at, rotation_angle_rad
-from bodycap_batch.model.merge_data import SolvedBody, standing_sigma_m
-from bodycap_batch.model.skeleton import Motion, forward_kinematics
+from bodycap_batch.model.merge_data import ON_TICK_TOLERANCE_NS, SolvedBody, standing_sigma_m
+from bodycap_batch.model.skeleton import Motion, forward_kinematics, local_rotations
 
 _MAX_GAP_INTERVALS = 1.6
 """Maximum time between two camera poses for interpolation between them, in frame intervals.
 
 Derivation: poses of neighbouring frames are one interval apart. If one frame between them is lost, they are
 two intervals apart. The threshold is between the two values.
-"""
-
-_SNAP_NS = 1_000_000
-"""Maximum time between a camera pose and a tick, nanoseconds, to use the pose without interpolation.
-
-Evidence: none; the motion in 1 ms is below the noise.
 """
 
 
@@ -85,7 +79,7 @@ def project_motion(
         local_rotation=result.local,
         observed=body.observed,
     )
-    return Projection(motion=motion, gap=_gap(body, motion, problem.cameras))
+    return Projection(motion=motion, gap=_gap(body, motion, problem))
 
 
 def projection_problem(
@@ -127,10 +121,7 @@ def initial_motion(body: SolvedBody) -> RigidMotion:
         The initial motion of the least-squares problem.
     """
     skeleton, solved = body.skeleton, body.solved
-    rotation = body.graph_world_from_joint[..., :3, :3]
-    local = rotation.copy()
-    for joint in range(1, len(skeleton.joints)):
-        local[:, joint] = np.swapaxes(rotation[:, skeleton.parents[joint]], -1, -2) @ rotation[:, joint]
+    local = local_rotations(skeleton, body.graph_world_from_joint[..., :3, :3])
     centres = forward_kinematics(skeleton, np.zeros((len(local), 3)), local)[..., :3, 3]
     used = solved if solved.any() else np.ones(len(solved), dtype=bool)
     root = (body.graph_world_from_joint[:, used][..., :3, 3] - centres[:, used]).mean(axis=1)
@@ -175,7 +166,7 @@ def _camera_targets(
             own_poses,
             body.times_ns(),
             max_gap_ns=round(_MAX_GAP_INTERVALS * float(interval)),
-            snap_ns=_SNAP_NS,
+            snap_ns=ON_TICK_TOLERANCE_NS,
         )
         out.append(
             CameraTarget(
@@ -189,7 +180,7 @@ def _camera_targets(
     return tuple(out)
 
 
-def _gap(body: SolvedBody, motion: Motion, cameras: tuple[CameraTarget, ...]) -> dict[str, Any]:
+def _gap(body: SolvedBody, motion: Motion, problem: ProjectionProblem) -> dict[str, Any]:
     """Return the differences between the rigid motion and the solution of the graph (`Projection.gap`)."""
     exported = motion.world_from_joint()
     out: dict[str, Any] = {}
@@ -201,7 +192,7 @@ def _gap(body: SolvedBody, motion: Motion, cameras: tuple[CameraTarget, ...]) ->
             target.world_from_cam[target.found],
             exported[target.found, target.joint] @ target.joint_from_cam,
         )
-        for target in cameras
+        for target in problem.cameras
         if target.found.any()
     }
     if body.standing is not None:
@@ -209,7 +200,7 @@ def _gap(body: SolvedBody, motion: Motion, cameras: tuple[CameraTarget, ...]) ->
             body.skeleton.joints[standing.joint]: _slide_speed(
                 exported[:, standing.joint, :3, 3], standing, body.fps
             )
-            for standing in _standing_joints(body)
+            for standing in problem.standing
         }
     return out
 

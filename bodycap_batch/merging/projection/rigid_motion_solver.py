@@ -153,10 +153,7 @@ class ProjectionProblem:
         """
         out = np.zeros((len(self.skeleton.joints), len(self.solved)))
         for joint in range(len(out)):
-            ancestor = joint
-            while ancestor >= 0:
-                out[joint, self.solved == ancestor] = 1.0
-                ancestor = int(self.skeleton.parents[ancestor])
+            out[joint, np.isin(self.solved, self.skeleton.path_to_root(joint))] = 1.0
         return out
 
     @property

@@ -9,6 +9,7 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.merging.body_calibration.calibrate_body import BodyCalibration
+from bodycap_batch.merging.body_calibration.calibration_covariance import PoseSigma
 from bodycap_batch.merging.body_calibration.camera_roll import (
     hanging_tracks,
     has_unknown_roll,
@@ -79,7 +80,6 @@ class MotionFacts:
         floor: The floor.
         still_ns: By camera that stands still in the room for some time while the trunk moves, the first and
             the last common time of the frames that are not used therefore.
-        slips: By camera whose mount slips, the slip.
         unused: By name of an unused camera, the reason why the camera is not used.
         aligned: By camera, uncertainty of the pose of this camera's map in the main map. The mapping contains
             only cameras whose map was aligned to the main map.
@@ -100,11 +100,10 @@ class MotionFacts:
     dropped: Mapping[str, IntArray]
     floor: Floor
     still_ns: Mapping[str, tuple[int, int]]
-    slips: Mapping[str, MountSlip]
     unused: Mapping[str, str]
-    aligned: Mapping[str, AlignedCameraReport]
-    joint_sigma_m: Mapping[str, Mapping[str, Mapping[str, float]]]
-    flexion_sigma_deg: Mapping[str, Mapping[str, Mapping[str, float]]]
+    aligned: Mapping[str, PoseSigma]
+    joint_sigma_m: Mapping[str, Mapping[str, Percentiles]]
+    flexion_sigma_deg: Mapping[str, Mapping[str, Percentiles]]
     joint_gap_m: Mapping[str, FloatArray]
     postures: Mapping[str, PostureDeviation]
     hinge_off_plane_m: Mapping[str, FloatArray]
@@ -134,7 +133,7 @@ def build_report(
     main_tracks = [track for track in tracks if track.camera not in facts.aligned]
     return MergeReport(
         scale=_scale_report(calibration),
-        t_pose=_t_pose_report(calibration, facts.start_ns),
+        t_pose=None if calibration.t_pose_ns is None else _span_report(calibration.t_pose_ns, facts.start_ns),
         up=_vertical_report(inputs.mounts, calibration, main_tracks),
         floor=FloorReport(source=facts.floor.source, points=facts.floor.support),
         mounts={
@@ -144,21 +143,22 @@ def build_report(
         cameras={track.camera: _camera_report(track, solution, facts) for track in tracks},
         exchanged_sides=_sides_report(inputs.mounts, calibration, main_tracks),
         inverted_cameras=_inverted_cameras_report(inputs.mounts, calibration),
-        slipped_mounts=_slips_report(calibration.mounts, facts),
+        slipped_mounts=_slips_report(calibration.mounts, facts.start_ns),
         still_cameras={
-            camera: SpanReport(
-                from_s=round(1e-9 * (first_ns - facts.start_ns), 3),
-                to_s=round(1e-9 * (last_ns - facts.start_ns), 3),
-            )
-            for camera, (first_ns, last_ns) in facts.still_ns.items()
+            camera: _span_report(span_ns, facts.start_ns) for camera, span_ns in facts.still_ns.items()
         },
         unused_cameras=dict(facts.unused),
-        joined_cameras=dict(facts.aligned),
+        joined_cameras={
+            camera: AlignedCameraReport(
+                sigma_deg=round(float(np.degrees(sigma.rotation_rad)), 3), sigma_m=round(sigma.position_m, 5)
+            )
+            for camera, sigma in facts.aligned.items()
+        },
         joint_gap_m=_percentiles_by_name(facts.joint_gap_m),
         posture_sigmas={role: round(posture.rms, 4) for role, posture in facts.postures.items()},
         mean_posture_sigmas={role: round(posture.mean, 4) for role, posture in facts.postures.items()},
-        joint_sigma_m=_sigmas_by_role(facts.joint_sigma_m),
-        flexion_sigma_deg=_sigmas_by_role(facts.flexion_sigma_deg),
+        joint_sigma_m=facts.joint_sigma_m,
+        flexion_sigma_deg=facts.flexion_sigma_deg,
         hinge_off_plane_m=_percentiles_by_name(facts.hinge_off_plane_m),
         loose_hinges={
             role: HingeReport(sigma_m=round(off_m, 5), known_to=describe_hinge(role, off_m))
@@ -176,12 +176,13 @@ def build_report(
 
 
 def _camera_report(track: CameraTrack, solution: MotionSolution, facts: MotionFacts) -> CameraReport:
+    residuals = solution.residuals[track.camera]
     return CameraReport(
         measurements=len(track.times_ns),
         dropped_as_gross_errors=len(facts.dropped[track.camera]),
-        down_weighted=int((solution.weights[track.camera] < _DOWN_WEIGHTED).sum()),
-        residual_m=_percentiles(solution.residual_m[track.camera]),
-        residual_deg=_percentiles(np.degrees(solution.residual_rad[track.camera])),
+        down_weighted=int((residuals.weights < _DOWN_WEIGHTED).sum()),
+        residual_m=_percentiles(residuals.distance_m),
+        residual_deg=_percentiles(np.degrees(residuals.angle_rad)),
         longest_gap_s=longest_gap_s(track, facts.start_ns, facts.end_ns),
     )
 
@@ -263,7 +264,7 @@ def _vertical_report(
         source=up.source,
         sigma_deg=round(up.sigma_deg, 2),
         body_off_deg=None if up.body_off_deg is None else round(up.body_off_deg, 3),
-        plane_points_share=round(up.plane_share, 3),
+        plane_points_share=round(up.share, 3),
         others=tuple(
             OtherVerticalReport(
                 name=other.source,
@@ -277,10 +278,8 @@ def _vertical_report(
     )
 
 
-def _t_pose_report(calibration: BodyCalibration, start_ns: int) -> SpanReport | None:
-    if calibration.t_pose_ns is None:
-        return None
-    first, last = (round(1e-9 * (time - start_ns), 3) for time in calibration.t_pose_ns)
+def _span_report(span_ns: tuple[int, int], start_ns: int) -> SpanReport:
+    first, last = (round(1e-9 * (time - start_ns), 3) for time in span_ns)
     return SpanReport(from_s=first, to_s=last)
 
 
@@ -299,9 +298,7 @@ def _mount_report(prior: Mount, solved: Mount, calibration: BodyCalibration) -> 
         roll_deg=None if search is None else search.chosen_deg,
         roll_runner_up=None
         if runner_up is None
-        else RunnerUpRollReport(
-            roll_deg=runner_up.roll_deg, half_squared_sigmas_more=round(runner_up.extra_cost, 2)
-        ),
+        else RunnerUpRollReport(roll_deg=runner_up[0], half_squared_sigmas_more=round(runner_up[1], 2)),
         joint_from_cam=tuple(tuple(row) for row in solved.joint_from_cam.tolist()),
         sigma_deg=round(float(np.degrees(solved.sigma_rad)), 3),
         sigma_m=round(solved.sigma_m, 5),
@@ -314,11 +311,9 @@ def _mount_report(prior: Mount, solved: Mount, calibration: BodyCalibration) -> 
     )
 
 
-def _slips_report(mounts: Sequence[Mount], facts: MotionFacts) -> SlippedMountsReport | None:
+def _slips_report(mounts: Sequence[Mount], start_ns: int) -> SlippedMountsReport | None:
     slips = {
-        mount.camera: _slip_report(mount, facts.slips[mount.camera], facts.start_ns)
-        for mount in mounts
-        if mount.camera in facts.slips
+        mount.camera: _slip_report(mount, mount.slip, start_ns) for mount in mounts if mount.slip is not None
     }
     return SlippedMountsReport(cameras=slips, says=describe_slips(slips)) if slips else None
 
@@ -345,15 +340,6 @@ def _activity_report(activity: Activity, violations_m: Mapping[str, FloatArray])
             if (violation > 0.0).any()
         },
     )
-
-
-def _sigmas_by_role(
-    sigmas: Mapping[str, Mapping[str, Mapping[str, float]]],
-) -> dict[str, dict[str, Percentiles]]:
-    return {
-        role: {name: Percentiles(**figures) for name, figures in each.items()}
-        for role, each in sigmas.items()
-    }
 
 
 def _percentiles_by_name(values: Mapping[str, FloatArray]) -> dict[str, Percentiles]:

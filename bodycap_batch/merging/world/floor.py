@@ -8,9 +8,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.merging.world.planes import MIN_POINTS
 from bodycap_batch.merging.world.vertical import Vertical
 from bodycap_batch.model.skeleton import SkeletonModel
-from bodycap_batch.model.skeleton_presets import rest_positions
+from bodycap_batch.model.skeleton_presets import ANKLE_OVER_LEG, rest_positions
 
 WALKING_HEIGHT_RATIO = 0.97
 """Ratio of the trunk's mean height while walking to its standing height. Evidence:
@@ -19,8 +20,6 @@ docs/decisions/merging.md."""
 SLAB_M = 0.03
 """Thickness (metres) of a horizontal slab in which points are counted. The slab of a found floor is twice as
 thick. Evidence: none."""
-_MIN_POINTS = 100
-"""Minimum number of map points for a search for the floor among all map points. Evidence: none."""
 _MIN_FLOOR_POINTS = 30
 """Minimum number of points in the slab of a floor. Evidence: none."""
 _MIN_FLOOR_RATIO = 3.0
@@ -43,10 +42,6 @@ heights of the floor are counted (see `_SEARCH_RATIO`). Evidence: none."""
 _LEGLESS_HIP_M = 0.9
 """Assumed height (metres) of the hips above the floor, for a skeleton without legs. It is used only if the
 zero pose does not give this height."""
-_ANKLE_OVER_LEG = 0.039 / 0.491
-"""Ratio of the ankle's height above the sole to the length of the leg. The product of this ratio and the leg
-length is the minimum height of the ankle. In a skeleton whose feet end at the ankle, this product is the
-height of the ankle. Source: R. Drillis, R. Contini, "Body segment parameters", 1966."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,25 +57,6 @@ class Floor:
     height_m: float
     source: str
     support: int
-
-
-@dataclass(frozen=True, slots=True)
-class LegLengths:
-    """The vertical lengths (metres) of a straight leg, for the height of a standing body.
-
-    Attributes:
-        hip_drop_m: Vertical distance from the root down to the hip joint in the zero pose.
-        leg_m: Length of the thigh plus length of the shin.
-        ankle_height_m: Height of the ankle above the sole.
-    """
-
-    hip_drop_m: float
-    leg_m: float
-    ankle_height_m: float
-
-    def root_height_m(self) -> float:
-        """Return the height (metres) of the root above the sole."""
-        return self.hip_drop_m + self.leg_m + self.ankle_height_m
 
 
 def floor_from_points(heights_m: FloatArray, up: Vertical, expected_m: float, standing_m: float) -> Floor:
@@ -101,7 +77,7 @@ def floor_from_points(heights_m: FloatArray, up: Vertical, expected_m: float, st
     Returns:
         The floor that was found in the map; otherwise a floor at the expected height.
     """
-    if up.source == "map" and len(heights_m) >= _MIN_POINTS:
+    if up.source == "map" and len(heights_m) >= MIN_POINTS:
         reach = _SEARCH_RATIO * standing_m
         edges = np.arange(expected_m - reach, expected_m + reach, 0.25 * SLAB_M)
         inside = (heights_m >= edges[:, None]) & (heights_m < edges[:, None] + SLAB_M)
@@ -162,15 +138,18 @@ def floor_from_feet(skeleton: SkeletonModel, world_from_joint: FloatArray, solve
     """
     ankles = [skeleton.index_of_role(side + "Foot") for side in ("Left", "Right")]
     heights = [world_from_joint[:, ankle, 2, 3] for ankle in ankles if ankle is not None and solved[ankle]]
-    legs = leg_lengths(skeleton)
+    legs = _leg_heights(skeleton)
     if not heights or not legs:
         return None
     lowest = float(np.percentile(np.min(heights, axis=0), 2.0))
-    return Floor(lowest - float(np.mean([leg.ankle_height_m for leg in legs])), "feet", 0)
+    return Floor(lowest - float(np.mean([ankle for _, ankle in legs])), "feet", 0)
 
 
-def leg_lengths(skeleton: SkeletonModel) -> list[LegLengths]:
-    """Return the lengths of each leg for which the skeleton has a hip, a knee and an ankle."""
+def _leg_heights(skeleton: SkeletonModel) -> list[tuple[float, float]]:
+    """Return the heights (metres) of root and ankle above the sole of each straight leg.
+
+    A leg counts if the skeleton has its hip, its knee and its ankle.
+    """
     out = []
     rest = rest_positions(skeleton)
     for side in ("Left", "Right"):
@@ -180,14 +159,10 @@ def leg_lengths(skeleton: SkeletonModel) -> list[LegLengths]:
         hip, knee, ankle = (rest[joint] for joint in chain if joint is not None)
         leg = float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
         toe = skeleton.index_of_role(side + "ToeBase")
+        # In a skeleton whose feet end at the ankle, the length of the leg gives the height of the ankle.
         toe_drop = float(ankle[2] - rest[toe][2]) if toe is not None else 0.0
-        out.append(
-            LegLengths(
-                hip_drop_m=float(rest[0][2] - hip[2]),
-                leg_m=leg,
-                ankle_height_m=max(toe_drop, _ANKLE_OVER_LEG * leg),
-            )
-        )
+        ankle_height = max(toe_drop, ANKLE_OVER_LEG * leg)
+        out.append((float(rest[0][2] - hip[2]) + leg + ankle_height, ankle_height))
     return out
 
 
@@ -199,7 +174,7 @@ def standing_height(skeleton: SkeletonModel, joint: int) -> float:
     """
     rest = rest_positions(skeleton)
     above_root = float(rest[joint][2] - rest[0][2])
-    legs = leg_lengths(skeleton)
+    legs = _leg_heights(skeleton)
     if legs:
-        return above_root + float(np.mean([leg.root_height_m() for leg in legs]))
+        return above_root + float(np.mean([root for root, _ in legs]))
     return above_root + (float(rest[0][2]) if rest[0][2] > 0.3 else _LEGLESS_HIP_M)

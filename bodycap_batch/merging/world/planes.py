@@ -21,8 +21,9 @@ none."""
 _THICKNESS_SIGMAS = 1.96
 """Maximum distance of a point from its plane, in sigmas of the points of the largest plane. Derivation: 95 %
 of the points of a plane are nearer."""
-_MIN_POINTS = 100
-"""Minimum number of map points for a search for planes. Evidence: none."""
+MIN_POINTS = 100
+"""Minimum number of map points for a search for planes, or for the floor among all points. Evidence:
+none."""
 _MIN_PLANE_POINTS = 25
 """Minimum number of points of a plane. Evidence: none."""
 _MIN_PLANE_SHARE = 0.03
@@ -97,7 +98,7 @@ def find_planes(points_m: FloatArray, rng: np.random.Generator) -> list[Plane]:
     """
     if len(points_m) > _MAX_POINTS:
         points_m = points_m[rng.choice(len(points_m), _MAX_POINTS, replace=False)]
-    if len(points_m) < _MIN_POINTS:
+    if len(points_m) < MIN_POINTS:
         return []
     smallest = max(_MIN_PLANE_POINTS, round(_MIN_PLANE_SHARE * len(points_m)))
     thickness_m = _thickness(points_m, _largest_plane(points_m, PLANE_HALF_THICKNESS_M, rng))

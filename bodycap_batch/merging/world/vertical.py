@@ -8,7 +8,7 @@ terms are set by hand.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -99,31 +99,21 @@ class VerticalHypothesis:
     negative_log_likelihood: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Vertical:
-    """The vertical in the solved frame of reference.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Vertical(VerticalHypothesis):
+    """The vertical in the solved frame of reference: the selected hypothesis.
 
     Attributes:
-        up: (3,) unit vector that points up.
-        source: Origin of the selected hypothesis.
         body_off_deg: Angle (degrees) to the up direction of the upright body; None if the vertical comes from
             the body.
-        plane_share: Fraction of the planes' points that agree with the vertical.
-        sigma_deg: Sigma (degrees) of the vertical.
         alternatives: Best hypothesis of each other source, and the best rival.
-        negative_log_likelihood: Negative log-likelihood (nats) of all observations.
         margin_nats: Negative log-likelihood (nats) of the best rival minus `negative_log_likelihood`; None if
             there is no rival. A rival is a hypothesis with a clearly different direction that does not come
             from the body. If the job gives verticals, only these verticals can be rivals.
     """
 
-    up: FloatArray
-    source: str
     body_off_deg: float | None
-    plane_share: float
-    sigma_deg: float = 0.0
     alternatives: tuple[VerticalHypothesis, ...] = ()
-    negative_log_likelihood: float = 0.0
     margin_nats: float | None = None
 
     def is_determined(self) -> bool:
@@ -206,14 +196,9 @@ def estimate_vertical(
     ]
     leans = _LEAN_SAMPLES * body.negative_log_likelihood(np.array([each.up for each in hypotheses]))
     hypotheses = [
-        VerticalHypothesis(
-            source=each.source,
-            up=each.up,
-            sigma_deg=each.sigma_deg,
-            share=each.share,
-            negative_log_likelihood=each.negative_log_likelihood
-            + lean
-            + _scene_penalty(each.up, planes, scene),
+        replace(
+            each,
+            negative_log_likelihood=_cost(each) + lean + _scene_penalty(each.up, planes, scene),
         )
         for each, lean in zip(hypotheses, leans.tolist(), strict=True)
     ]
@@ -307,13 +292,9 @@ def _vertical_from_hypotheses(
     if rival is not None and all(rival is not each for each in alternatives):
         alternatives.append(rival)
     return Vertical(
-        up=selected.up,
-        source=selected.source,
+        **{item.name: getattr(selected, item.name) for item in fields(selected)},
         body_off_deg=None if selected.source == "body" else angle_deg(selected.up, upright),
-        plane_share=selected.share,
-        sigma_deg=selected.sigma_deg,
         alternatives=tuple(alternatives),
-        negative_log_likelihood=selected.negative_log_likelihood,
         margin_nats=None if rival is None else _cost(rival) - _cost(selected),
     )
 

@@ -96,7 +96,7 @@ def test_residuals_follow_moved_cameras_as_predicted(walk, recorded):
     poses = samples.map_from_cam.copy()
     poses[1, :, :3, :3] = so3_exp(twist[:3]) @ poses[1, :, :3, :3]
     poses[1, :, :3, 3] += twist[3:]
-    calibration.set_samples(replace(samples, map_from_cam=poses))
+    calibration.samples = replace(samples, map_from_cam=poses)
     after = calibration.linearised().linear
     # The right-hand side changes with the movement; robust weights change in second order.
     assert np.abs(predicted).max() > 1e-4

@@ -19,6 +19,7 @@ from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.skeleton_presets import load_skeleton
 from tests.stages.walker import make_inputs, make_walk, record
 
+ONE_MAP = {"map-0": Similarity(1.0, np.eye(3), np.zeros(3))}
 GAUGE = Similarity(0.25, so3_exp([0.3, 1.0, -0.2]), np.array([2.0, 0.0, 1.0]))
 
 
@@ -37,11 +38,11 @@ def test_a_known_distance_gives_the_scale(inputs):
     walk, merged = inputs
     ends = walk.camera("torso", np.array([0.0, 80.0]) / 30.0)[:, :3, 3]
     metres = float(np.linalg.norm(ends[1] - ends[0]))
-    source = known_distance(merged.trajectories, ("torso:0", "torso:80", metres))
+    source = known_distance(merged.trajectories, ("torso:0", "torso:80", metres), ONE_MAP)
     # 3 mm of noise an axis at both ends, the floor of 4 mm on top, over some 2.5 m.
     assert 0.003 < source.sigma_log < 0.006
     assert abs(np.log(source.scale * GAUGE.scale)) < 3.0 * source.sigma_log
-    assert known_distance(merged.trajectories, None) is None
+    assert known_distance(merged.trajectories, None, ONE_MAP) is None
 
 
 @pytest.mark.parametrize(
@@ -55,7 +56,7 @@ def test_a_known_distance_gives_the_scale(inputs):
 )
 def test_an_unusable_known_distance_is_refused_with_the_reason(inputs, first, second, error, says):
     with pytest.raises(error, match=says):
-        known_distance(inputs[1].trajectories, (first, second, 1.0))
+        known_distance(inputs[1].trajectories, (first, second, 1.0), ONE_MAP)
 
 
 def test_a_known_distance_needs_one_map(inputs):
@@ -65,7 +66,7 @@ def test_a_known_distance_needs_one_map(inputs):
     )
     apart = replace(inputs[1], trajectories=trajectories)
     with pytest.raises(JobError, match="have no place in common"):
-        known_distance(apart.trajectories, ("torso:0", "left_palm:0", 1.0))
+        known_distance(apart.trajectories, ("torso:0", "left_palm:0", 1.0), ONE_MAP)
 
 
 def test_every_mount_has_a_movement_that_reduces_its_uncertainty():

@@ -77,7 +77,7 @@ def test_cameras_upside_down_are_named_with_the_measured_roll(upside_down, given
 
 
 def test_it_is_said_if_nothing_shows_which_way_up_a_camera_is_mounted():
-    vertical = Vertical(UP, "map", 3.0, 0.9, sigma_deg=1.0)
+    vertical = Vertical(up=UP, source="map", sigma_deg=1.0, body_off_deg=3.0, share=0.9)
     assert describe_vertical(vertical).endswith("(1 sigma)")
     text = describe_vertical(vertical, describe_unknown_way_up("torso"))
     assert "torso is assumed to be mounted upright" in text
@@ -118,19 +118,19 @@ def _own_up(inputs, tracks):
 def test_the_reference_camera_is_above_the_hands(roll):
     inputs, tracks = _with_rolls({"torso": roll})
     # Planes agree with any of the four rolls: the up direction of each one is a direction of the room.
-    chosen, up = _reference_roll(inputs, tracks, _own_up(inputs, tracks))
-    assert chosen == roll
-    assert up @ UP > 0.9
+    own_up = _own_up(inputs, tracks)
+    assert _reference_roll(inputs, tracks, own_up) == roll
+    assert own_up(roll) @ UP > 0.9
 
 
 @pytest.mark.parametrize("roll", [0.0, 90.0, 180.0, 270.0])
 def test_hanging_hands_give_the_roll_if_the_surroundings_give_no_vertical(roll):
     inputs, tracks = _with_rolls({"torso": roll})
     own_up = _own_up(inputs, tracks)
-    assert _reference_roll(inputs, tracks, lambda _: None, own_up) == (roll, None)
+    assert _reference_roll(inputs, tracks, lambda _: None, own_up) == roll
     # One hand alone, or an unknown direction of the trunk, decides nothing.
-    assert _reference_roll(inputs, tracks[:2], lambda _: None, own_up) == (0.0, None)
-    assert _reference_roll(inputs, tracks, lambda _: None) == (0.0, None)
+    assert _reference_roll(inputs, tracks[:2], lambda _: None, own_up) == 0.0
+    assert _reference_roll(inputs, tracks, lambda _: None) == 0.0
 
 
 def _record_roles(roles, over_m=None):
@@ -151,18 +151,15 @@ def _record_roles(roles, over_m=None):
 def test_hands_at_work_do_not_change_the_roll_of_a_camera_at_the_belt(role):
     inputs, tracks = _record_roles((role, "LeftHand", "RightHand"), over_m=0.18)
     own_up = _own_up(inputs, tracks)
-    assert _reference_roll(inputs, tracks, lambda _: None, own_up) == (0.0, None)
+    assert _reference_roll(inputs, tracks, lambda _: None, own_up) == 0.0
     # The same holds if planes agree with any of the four rolls.
-    assert _reference_roll(inputs, tracks, own_up)[0] == 0.0
+    assert _reference_roll(inputs, tracks, own_up) == 0.0
 
 
 @pytest.mark.parametrize("part", ["Shoulder", "Arm"])
 def test_shoulders_above_the_chest_do_not_change_its_roll(part):
     inputs, tracks = _record_roles(("Spine1", f"Left{part}", f"Right{part}"), over_m=0.17)
-    assert _reference_roll(inputs, tracks, lambda _: None, _own_up(inputs, tracks)) == (
-        0.0,
-        None,
-    )
+    assert _reference_roll(inputs, tracks, lambda _: None, _own_up(inputs, tracks)) == 0.0
 
 
 @pytest.mark.parametrize("roll", [90.0, 180.0])
@@ -171,10 +168,7 @@ def test_legs_give_the_roll_of_a_camera_at_the_belt(roll):
     turn = with_roll(replace(inputs.mounts[0], joint_from_cam=np.eye(4)), roll).joint_from_cam
     leading = replace(tracks[0], map_from_cam=tracks[0].map_from_cam @ turn)
     turned = [leading, *tracks[1:]]
-    assert _reference_roll(inputs, turned, lambda _: None, _own_up(inputs, turned)) == (
-        roll,
-        None,
-    )
+    assert _reference_roll(inputs, turned, lambda _: None, _own_up(inputs, turned)) == roll
 
 
 def test_hands_lifted_half_of_the_time_do_not_change_the_roll():
@@ -188,10 +182,7 @@ def test_hands_lifted_half_of_the_time_do_not_change_the_roll():
         below = (trunk[late, :3, 3] - poses[late, :3, 3]) @ UP
         poses[late, :3, 3] += 2.0 * below[:, None] * UP
         lifted.append(replace(track, map_from_cam=poses))
-    assert _reference_roll(inputs, [tracks[0], *lifted], lambda _: None, own_up) == (
-        0.0,
-        None,
-    )
+    assert _reference_roll(inputs, [tracks[0], *lifted], lambda _: None, own_up) == 0.0
 
 
 def test_the_runner_up_is_the_best_of_the_rest():
@@ -207,4 +198,4 @@ def test_one_hand_alone_does_not_change_the_roll():
     def up_of(degrees):
         return None if degrees == 0.0 else aside[:, 0] * (1.0 if degrees == 90.0 else -1.0)
 
-    assert _reference_roll(inputs, tracks[:2], up_of) == (0.0, None)
+    assert _reference_roll(inputs, tracks[:2], up_of) == 0.0

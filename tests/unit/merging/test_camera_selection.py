@@ -13,13 +13,14 @@ from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging import merge_trajectories
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body_calibration.calibrate_body import preliminary_vertical
+from bodycap_batch.merging.body_calibration.calibration_covariance import PoseSigma
 from bodycap_batch.merging.body_calibration.samples import MAP_ERROR_RAD, take_samples
-from bodycap_batch.merging.camera_selection import correlate_mount_priors
 from bodycap_batch.merging.cameras.excluded_cameras import excluded_cameras, rarely_localised
 from bodycap_batch.merging.cameras.track import MIN_SIGMA_RAD, make_track
 from bodycap_batch.merging.main_map import align_usable_cameras, candidate_main_maps
 from bodycap_batch.merging.map_alignment import align, similarity_refinement
 from bodycap_batch.merging.map_alignment.align import AlignedMap, align_cameras
+from bodycap_batch.merging.rig_priors import correlate_mount_priors
 from bodycap_batch.merging.stage import timeline
 from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
 from bodycap_batch.model.scene import FrameStatus
@@ -28,6 +29,18 @@ from tests.bench.posed import posed
 from tests.stages.walker import NOISE_M, NOISE_RAD, ROLES, make_inputs, make_walk, record
 
 CAMERAS = ("torso", "head", "left_palm", "right_palm", "left_upper_arm")
+
+
+def _candidates(inputs):
+    return candidate_main_maps(inputs, excluded_cameras(inputs))
+
+
+def _aligned(inputs):
+    return align_usable_cameras(inputs, lambda: None, MergeOptions(), excluded_cameras(inputs))
+
+
+def _correlated(inputs):
+    return correlate_mount_priors(inputs, excluded_cameras(inputs))
 
 
 @pytest.fixture(scope="module")
@@ -70,9 +83,9 @@ def _names(trajectories):
 
 
 def test_the_reference_camera_is_on_the_trunk_or_else_on_the_head(capture):
-    assert _names(candidate_main_maps(capture.inputs)[0][0])[:2] == ["torso", "head"]
+    assert _names(_candidates(capture.inputs)[0][0])[:2] == ["torso", "head"]
     lost = _lose(capture.inputs, "torso", 6)
-    assert _names(candidate_main_maps(lost)[0][0])[0] == "head"
+    assert _names(_candidates(lost)[0][0])[0] == "head"
     assert rarely_localised(lost.trajectories) == {
         "torso": f"only 6 of {6 * 30} frames were localised, but 15 are needed"
     }
@@ -110,7 +123,7 @@ def _lying(poses):
 def test_a_stationary_camera_is_excluded(capture):
     lying = _with_palm(capture.inputs, _lying)
     assert list(excluded_cameras(lying)) == ["left_palm"]
-    together = align_usable_cameras(lying, lambda: None)
+    together = _aligned(lying)
     assert "left_palm" not in _names(together.trajectories)
     assert "stands still" in together.unused["left_palm"]
 
@@ -199,7 +212,7 @@ def test_stationary_cameras_are_searched_once(walked, monkeypatch, tmp_path):
 
 
 def test_a_rarely_localised_camera_on_the_trunk_is_not_the_reference(capture):
-    (main, further), *others = candidate_main_maps(_lose(capture.inputs, "torso", 30))
+    (main, further), *others = _candidates(_lose(capture.inputs, "torso", 30))
     assert _names(main)[0] == "head"
     assert _names(main)[-1] == "torso"
     assert not further
@@ -208,7 +221,7 @@ def test_a_rarely_localised_camera_on_the_trunk_is_not_the_reference(capture):
 
 def test_a_camera_on_the_trunk_alone_in_a_small_map_is_in_a_further_map(capture):
     short = _in_maps(_lose(capture.inputs, "torso", 30), {"torso": "small"})
-    first, second = candidate_main_maps(short)
+    first, second = _candidates(short)
     assert "torso" not in _names(first[0])
     assert _names(first[1]) == ["torso"]
     assert _names(second[0]) == ["torso"]
@@ -219,7 +232,7 @@ def test_the_next_main_map_is_tried_if_one_does_not_determine_the_scale(capture,
     monkeypatch.setattr(
         align, "align_maps", lambda *_: (_ for _ in ()).throw(EstimationError("nowhere to be placed"))
     )
-    together = align_usable_cameras(alone, lambda: None)
+    together = _aligned(alone)
     assert "torso" not in _names(together.trajectories)
     assert len(together.trajectories) == len(CAMERAS) - 1
     assert "nowhere to be placed" in together.unused["torso"]
@@ -238,10 +251,10 @@ def test_hands_alone_do_not_determine_the_scale_and_the_error_names_what_is_miss
         EstimationError,
         match=r"no two cameras .*are 'left_palm', 'right_palm'; the unusable cameras are 'torso'",
     ):
-        align_usable_cameras(_lose(hands, "torso", 6), lambda: None)
+        _aligned(_lose(hands, "torso", 6))
     nobody = replace(hands, trajectories=hands.trajectories[:1])
     with pytest.raises(EstimationError, match="usable cameras are none"):
-        align_usable_cameras(_lose(nobody, "torso", 6), lambda: None)
+        _aligned(_lose(nobody, "torso", 6))
 
 
 def test_cameras_that_only_lack_a_clock_are_advised_to_clap(capture):
@@ -250,11 +263,11 @@ def test_cameras_that_only_lack_a_clock_are_advised_to_clap(capture):
         for name, clock in capture.inputs.clocks.items()
     }
     with pytest.raises(EstimationError) as caught:
-        align_usable_cameras(replace(capture.inputs, clocks=unknown), lambda: None)
+        _aligned(replace(capture.inputs, clocks=unknown))
     assert "clap once" in str(caught.value.hint)
     lost = _lose(replace(capture.inputs, clocks=unknown), "torso", 6)
     with pytest.raises(EstimationError) as caught:
-        align_usable_cameras(lost, lambda: None)
+        _aligned(lost)
     assert "film the same places" in str(caught.value.hint)
 
 
@@ -293,16 +306,14 @@ def test_one_bad_map_does_not_exclude_the_others(capture, monkeypatch):
         return (
             AlignedMap(
                 gauge="good",
-                cameras=("left_palm",),
                 main_from_gauge=here,
-                sigma_rad=0.01,
-                sigma_m=0.01,
+                sigma=PoseSigma(0.01, 0.01),
                 reason=None,
             ),
         )
 
     monkeypatch.setattr(align, "align_maps", place)
-    main, further = candidate_main_maps(inputs)[0]
+    main, further = _candidates(inputs)[0]
     together = align_cameras(inputs, main, further, lambda: None)
     assert asked == [("map-0", "good", "bad"), ("map-0", "good"), ("map-0", "bad")]
     assert "left_palm" in _names(together.trajectories)
@@ -330,7 +341,7 @@ def _with_twin(inputs, **changes):
 def test_cameras_at_one_position_are_together_as_uncertain_as_one(capture):
     inputs = capture.inputs
     alone = inputs.mount_of("torso")
-    shared = correlate_mount_priors(_with_twin(inputs))
+    shared = _correlated(_with_twin(inputs))
     for camera in ("torso", "torso_2"):
         mount = shared.mount_of(camera)
         assert mount.sigma_m == pytest.approx(np.sqrt(2.0) * alone.sigma_m)
@@ -340,9 +351,9 @@ def test_cameras_at_one_position_are_together_as_uncertain_as_one(capture):
     behind = alone.joint_from_cam.copy()
     behind[1, 3] += 0.2
     for other in ({"joint_from_cam": behind}, {"sigma_rad": 0.02, "sigma_m": 0.01, "by_name": False}):
-        assert correlate_mount_priors(_with_twin(inputs, **other)).mount_of("torso") == alone
-    assert correlate_mount_priors(_lose(_with_twin(inputs), "torso_2", 6)).mount_of("torso") == alone
-    assert correlate_mount_priors(inputs).mounts == inputs.mounts
+        assert _correlated(_with_twin(inputs, **other)).mount_of("torso") == alone
+    assert _correlated(_lose(_with_twin(inputs), "torso_2", 6)).mount_of("torso") == alone
+    assert _correlated(inputs).mounts == inputs.mounts
 
 
 def test_the_error_of_a_map_counts_once_for_two_cameras_on_a_bone(capture):

@@ -21,7 +21,7 @@ from tests.bench.posed import posed
 def _groups(maps, seed):
     """Return bones, mounts, tracks by map (the trunk's first), and map units per metre of the main map."""
     capture = posed(SynthOptions(seconds=20.0, cameras=tuple(maps), seed=seed, poses_only=True), maps)
-    inputs, (main, further) = capture.inputs, candidate_main_maps(capture.inputs)[0]
+    inputs, (main, further) = capture.inputs, candidate_main_maps(capture.inputs, ())[0]
     bones = kinematic_chain(inputs.skeleton, {mount.role for mount in inputs.mounts})
     index = {bone.role: place for place, bone in enumerate(bones)}
     groups = {}

@@ -11,28 +11,26 @@ from numpy.testing import assert_allclose
 
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.cameras.track import make_track
-from bodycap_batch.merging.graph.error_modes import ErrorModes, stack_modes
+from bodycap_batch.merging.graph.error_modes import ErrorModes, no_modes, stack_modes
 from bodycap_batch.merging.graph.factors import bone_key
 from bodycap_batch.merging.graph.joint_covariance import (
-    flexion_percentiles,
-    flexion_sigma,
     joint_covariance,
+    on_skeleton,
     sigma_percentiles,
 )
 from bodycap_batch.merging.graph.motion_graph import MotionGraph, MotionSolution
 from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 from bodycap_batch.model.geometry import make_transform, se3_adjoint, so3_exp
+from bodycap_batch.model.merge_report import Percentiles
 from tests.stages.walker import FPS, ROLES, make_inputs, make_walk, record
 
 
 def test_a_graph_without_factors_has_no_covariance(walk):
     graph, bones, _ = _graph(walk)
-    values, _ = levenberg_marquardt(graph.graph, graph.initial_values(), iterations=1, step=lambda: None)
-    loose = replace(graph.solved_graph(values), graph=gtsam.NonlinearFactorGraph())
+    graph.solve(1, lambda: None)
+    graph.graph = gtsam.NonlinearFactorGraph()
     poses = np.tile(np.eye(4), (round(FPS), len(bones), 1, 1))
-    unchanged = np.zeros((len(bones), 3, 0))
-    modes = ErrorModes(mounts={}, log_scale=np.zeros(0), rest=unchanged, offsets_m=unchanged)
-    uncertainty = joint_covariance(loose, poses, modes)
+    uncertainty = joint_covariance(graph, poses, no_modes(bones, (), 0))
     assert uncertainty.centre_m2.shape == (*poses.shape[:2], 3, 3)
     assert np.isnan(uncertainty.centre_m2).all()
     assert uncertainty.flexion_rad2.shape == poses.shape[:2]
@@ -73,17 +71,14 @@ def _graph(walk, mounts=None, change=None, scale=1.0, shift_s=0.0):
 
 
 def _solve(graph, modes=None) -> MotionSolution:
-    return graph.solve(60, lambda *_: None, modes)
+    solution = graph.solve(60, lambda: None)
+    if modes is None:
+        return solution
+    return replace(solution, uncertainty=joint_covariance(graph, solution.world_from_bone, modes))
 
 
 def _no_modes(bones) -> ErrorModes:
-    empty = np.zeros((len(bones), 3, 1))
-    return ErrorModes(
-        mounts={name: np.zeros((6, 1)) for name in ROLES},
-        log_scale=np.zeros(1),
-        rest=empty,
-        offsets_m=empty.copy(),
-    )
+    return no_modes(bones, ROLES, 1)
 
 
 def _centres(solution: MotionSolution) -> np.ndarray:
@@ -125,7 +120,6 @@ def test_without_error_modes_the_covariance_is_the_marginal_of_gtsam(walk):
 
 
 def _optimised(graph):
-    from bodycap_batch.merging.graph.optimiser import levenberg_marquardt
 
     return levenberg_marquardt(graph.graph, graph.initial_values(), iterations=60, step=lambda: None)
 
@@ -183,15 +177,15 @@ def test_stacked_modes_contain_those_of_all_parts(walk):
 
 
 def test_sigmas_of_observed_and_filled_ticks_are_separate():
-    covariance = np.tile(np.eye(3) * 1e-4, (10, 3, 1, 1))
-    covariance[5:, 1] *= 4.0
-    covariance[:, 2] = np.nan
+    sigma = np.full((10, 3), 0.01)
+    sigma[5:, 1] *= 2.0
+    sigma[:, 2] = np.nan
     observed = np.ones((10, 3), dtype=bool)
     observed[5:, 1] = False
-    covariance[:, 0] = 0.0
-    found = sigma_percentiles(("Spine1", "LeftHand", "LeftFoot"), covariance, observed)
+    sigma[:, 0] = 0.0
+    found = sigma_percentiles(("Spine1", "LeftHand", "LeftFoot"), sigma, observed, digits=5)
     assert found == {
-        "LeftHand": {"observed": {"p50": 0.01, "p95": 0.01}, "filled": {"p50": 0.02, "p95": 0.02}}
+        "LeftHand": {"observed": Percentiles(p50=0.01, p95=0.01), "filled": Percentiles(p50=0.02, p95=0.02)}
     }
 
 
@@ -199,17 +193,16 @@ def test_the_sigma_of_a_hinge_is_that_of_the_bone_below_it(walk):
     graph, bones, _ = _graph(walk)
     solution = _solve(graph, _no_modes(bones))
     roles = [bone.role for bone in bones]
-    sigma = flexion_sigma(bones, solution.uncertainty, len(walk.skeleton.joints))
+    assert solution.uncertainty is not None
+    sigma = on_skeleton(bones, np.sqrt(solution.uncertainty.flexion_rad2), len(walk.skeleton.joints))
     known = {walk.skeleton.roles[joint] for joint in np.flatnonzero(np.isfinite(sigma).all(axis=0))}
     assert known == {"LeftForeArm", "RightForeArm"} & set(roles)
-    assert flexion_sigma(bones, None, 3) is None
     observed = np.ones(sigma.shape, dtype=bool)
-    found = flexion_percentiles(walk.skeleton.roles, sigma, observed)
+    found = sigma_percentiles(walk.skeleton.roles, np.degrees(sigma), observed, digits=2)
     joint = walk.skeleton.roles.index("LeftForeArm")
-    assert found["LeftForeArm"]["observed"]["p50"] == pytest.approx(
+    assert found["LeftForeArm"]["observed"].p50 == pytest.approx(
         np.degrees(np.median(sigma[:, joint])), abs=0.01
     )
-    assert flexion_percentiles(walk.skeleton.roles, None, observed) == {}
 
 
 def test_a_mounts_error_moves_the_joint_by_its_lever(walk):

@@ -41,7 +41,10 @@ CAMERA = Camera(model="PINHOLE", width_px=320, height_px=240, params=np.array(LE
 def _board(
     inputs: MergeInputs, options: MergeOptions, main_from_gauge: dict[str, Similarity] | None = None
 ) -> LocatedBoard:
-    board = locate_board(inputs.trajectories, inputs.board_views, options.marker_board, main_from_gauge)
+    in_one_map = {each.gauge: Similarity(1.0, np.eye(3), np.zeros(3)) for each in inputs.trajectories}
+    board = locate_board(
+        inputs.trajectories, inputs.board_views, options.marker_board, main_from_gauge or in_one_map
+    )
     assert board is not None
     return board
 
@@ -194,7 +197,7 @@ def test_views_in_the_main_map_come_before_those_in_an_aligned_one():
 def test_a_board_without_enough_views_is_refused():
     rng = np.random.default_rng(0)
     asked = MergeOptions(marker_board=FLAT)
-    assert locate_board(_inputs(_path(4)).trajectories, (), None) is None
+    assert locate_board(_inputs(_path(4)).trajectories, (), None, {}) is None
     with pytest.raises(EstimationError, match="found in only 2 keyframes"):
         _scale(_inputs(_path(2), _views(_path(2), rng)), asked)
     still = np.repeat(_path(1), 6, axis=0)

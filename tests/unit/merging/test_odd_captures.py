@@ -13,7 +13,6 @@ from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body.provisional_scale import reach_constraint
 from bodycap_batch.merging.body_calibration import mount_calibration_graph
 from bodycap_batch.merging.body_calibration.calibration_covariance import (
-    ScaleUncertainty,
     error_modes,
     mounts_with_sigmas,
 )
@@ -21,7 +20,6 @@ from bodycap_batch.merging.body_calibration.known_distance import known_distance
 from bodycap_batch.merging.body_calibration.mount_calibration_graph import CalibrationGraph
 from bodycap_batch.merging.body_calibration.samples import take_samples
 from bodycap_batch.merging.body_calibration.scale import estimate_scale
-from bodycap_batch.merging.body_calibration.skeleton_error_modes import skeleton_error_modes
 from bodycap_batch.merging.cameras.track import inflate_sigmas, make_track
 from bodycap_batch.merging.graph.motion_graph import MotionGraph
 from bodycap_batch.merging.graph.windows import with_overlap
@@ -74,8 +72,7 @@ def test_a_camera_never_measured_with_others_keeps_its_nominal_mount_and_its_sig
     assert np.isfinite(calibration.solve(1.0))
     usual = mounts["right_palm"].joint_from_cam
     assert np.abs(calibration.mounts["right_palm"] - usual).max() < 1e-3
-    scale = ScaleUncertainty(0.05, {name: np.zeros((4, 4)) for name in ROLES})
-    constant = error_modes(calibration, scale, {}).constant
+    constant, _ = error_modes(calibration, 0.05, {name: np.zeros((4, 4)) for name in ROLES}, {})
     solved = {mount.camera: mount for mount in mounts_with_sigmas(calibration, constant)}
     loose = inflate_sigmas(tracks[2], solved["right_palm"])
     # 15 degrees in all, 8.7 per axis.
@@ -92,10 +89,9 @@ def test_bone_lengths_from_a_height_vary_on_both_sides_alike(body):
     mounts = {mount.camera: mount for mount in inputs.mounts}
     calibration = CalibrationGraph(inputs.skeleton, bones, samples, mounts, 1.0, lambda: None)
     calibration.solve(1.0)
-    scale = ScaleUncertainty(0.01, {name: np.zeros((4, 4)) for name in ROLES})
-    known = error_modes(calibration, scale, {}).constant
-    from_height = error_modes(calibration, scale, {}, skeleton_error_modes(bones, tuple(ROLES), 1.75))
-    likely = from_height.constant
+    slope = {name: np.zeros((4, 4)) for name in ROLES}
+    known, _ = error_modes(calibration, 0.01, slope, {})
+    likely, transient = error_modes(calibration, 0.01, slope, {}, 1.75)
     assert not known.offsets_m.any()
     index = {bone.role: place for place, bone in enumerate(bones)}
     for side in ("Left", "Right"):
@@ -111,7 +107,7 @@ def test_bone_lengths_from_a_height_vary_on_both_sides_alike(body):
     before, after = (np.linalg.norm(each.mounts["left_palm"][3:]) for each in (known, likely))
     assert before < after < 2.0 * before
     # Another placement of the joints is a transient mode.
-    assert from_height.transient.offsets_m.any()
+    assert transient.offsets_m.any()
 
 
 def test_a_camera_never_measured_with_the_reference_camera_is_sampled_with_another(body):
@@ -153,7 +149,7 @@ def test_a_t_pose_is_no_gesture(body, monkeypatch):
     assert (times_ns == samples.times_ns[~posed]).all()
     assert (poses == calibration.poses()[~posed]).all()
     nothing_else = replace(samples.posture, t_pose=np.ones_like(posed))
-    calibration.set_samples(replace(samples, posture=nothing_else))
+    calibration.samples = replace(samples, posture=nothing_else)
     calibration.widen_joint_priors()
     assert len(asked) == 1
 
@@ -200,7 +196,7 @@ def test_a_known_distance_in_a_further_map_is_in_that_maps_units(body, recorded)
     )
     asked = ("right_palm:0", "right_palm:90", 2.0)
     half = Similarity(0.5, np.eye(3), np.zeros(3))
-    alone = known_distance(inputs.trajectories, asked)
+    alone = known_distance(inputs.trajectories, asked, {"map-1": Similarity(1.0, np.eye(3), np.zeros(3))})
     placed = known_distance(inputs.trajectories, asked, {"map-0": half, "map-1": half})
     assert placed.scale == pytest.approx(2.0 * alone.scale)
     with pytest.raises(EstimationError, match="not aligned with the main map"):

@@ -336,10 +336,17 @@ def test_walls_and_floor_give_the_vertical_and_the_floor():
     bent = vertical_from_planes(planes, body, BENT_TILT_LIMIT_DEG)
     assert bent is not None
     assert np.degrees(np.arccos(bent.up @ turn @ UP)) < 0.5
-    floor_found = floor_from_points(room @ UP, Vertical(UP, "map", 0.0, 1.0), 0.08, 1.2)
+    floor_found = floor_from_points(
+        room @ UP, Vertical(up=UP, source="map", sigma_deg=0.0, body_off_deg=0.0, share=1.0), 0.08, 1.2
+    )
     assert floor_found.source == "map"
     assert floor_found.height_m == pytest.approx(0.0, abs=0.01)
-    assert floor_from_points(room @ UP, Vertical(UP, "body", None, 0.0), 0.08, 1.2).height_m == 0.08
+    assert (
+        floor_from_points(
+            room @ UP, Vertical(up=UP, source="body", sigma_deg=0.0, body_off_deg=None, share=0.0), 0.08, 1.2
+        ).height_m
+        == 0.08
+    )
 
 
 @pytest.mark.parametrize(("floor", "source"), [(0, "map"), (3, "map"), (13, "standing hip height")])
@@ -354,7 +361,9 @@ def test_a_surface_above_the_floor_is_not_the_floor(floor, source):
             rng.uniform(0.5, 2.5, size=3000),
         ]
     )
-    found = floor_from_points(heights, Vertical(UP, "map", 0.0, 1.0), 0.01, 1.2)
+    found = floor_from_points(
+        heights, Vertical(up=UP, source="map", sigma_deg=0.0, body_off_deg=0.0, share=1.0), 0.01, 1.2
+    )
     assert found.source == source
     if source != "map":
         assert found.height_m == 0.01
@@ -375,12 +384,22 @@ def _beside_a_walk(rng, floor, clutter):
 @pytest.mark.parametrize("expected", [-0.15, 0.0, 0.2])
 def test_a_few_points_beside_the_path_show_the_floor(expected):
     path, points = _beside_a_walk(np.random.default_rng(1), 8, 3)
-    found = floor_beside_path(points, path, Vertical(UP, "map", 0.0, 1.0), expected, 1.2)
+    found = floor_beside_path(
+        points, path, Vertical(up=UP, source="map", sigma_deg=0.0, body_off_deg=0.0, share=1.0), expected, 1.2
+    )
     assert found.source == "map"
     assert 8 <= found.support <= 11
     # The points are within a centimetre of it; one point of clutter moves the median by no more.
     assert found.height_m == pytest.approx(0.0, abs=0.01)
-    assert floor_from_points(points @ UP, Vertical(UP, "map", 0.0, 1.0), expected, 1.2).source != "map"
+    assert (
+        floor_from_points(
+            points @ UP,
+            Vertical(up=UP, source="map", sigma_deg=0.0, body_off_deg=0.0, share=1.0),
+            expected,
+            1.2,
+        ).source
+        != "map"
+    )
 
 
 @pytest.mark.parametrize(
@@ -388,8 +407,22 @@ def test_a_few_points_beside_the_path_show_the_floor(expected):
 )
 def test_clutter_beside_the_path_is_not_the_floor(floor, clutter, source):
     path, points = _beside_a_walk(np.random.default_rng(1), floor, clutter)
-    assert floor_beside_path(points, path, Vertical(UP, source, 0.0, 1.0), 0.0, 1.2) is None
-    assert floor_beside_path(points[:0], path, Vertical(UP, source, 0.0, 1.0), 0.0, 1.2) is None
+    assert (
+        floor_beside_path(
+            points, path, Vertical(up=UP, source=source, sigma_deg=0.0, body_off_deg=0.0, share=1.0), 0.0, 1.2
+        )
+        is None
+    )
+    assert (
+        floor_beside_path(
+            points[:0],
+            path,
+            Vertical(up=UP, source=source, sigma_deg=0.0, body_off_deg=0.0, share=1.0),
+            0.0,
+            1.2,
+        )
+        is None
+    )
 
 
 @pytest.mark.parametrize("depth_m", [0.08, 0.12, 0.16])
@@ -573,8 +606,9 @@ def test_the_reach_from_the_head_to_a_palm_starts_at_the_shoulder():
     assert found is not None
     rest = rest_positions(skeleton)
     shoulder = rest[skeleton.roles.index("LeftArm")] - rest[skeleton.roles.index("Head")]
-    assert_allclose(found.anchor_m, shoulder, atol=1e-12)
-    assert found.reach_m == pytest.approx((0.186 + 0.146) * 1.75)
+    anchor_m, reach_m = found
+    assert_allclose(anchor_m, shoulder, atol=1e-12)
+    assert reach_m == pytest.approx((0.186 + 0.146) * 1.75)
     palms = kinematic_chain(skeleton, ("LeftHand", "RightHand"))
     assert reach_constraint(palms, 4, len(palms) - 1) is None
 

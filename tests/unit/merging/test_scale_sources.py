@@ -12,18 +12,17 @@ from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.merging.body.bones import kinematic_chain
 from bodycap_batch.merging.body_calibration.calibrate_body import reference_camera_roll
 from bodycap_batch.merging.body_calibration.scale import ScaleSource
+from bodycap_batch.merging.body_calibration.stated_constraints import StatedConstraints, stated_constraints
 from bodycap_batch.merging.cameras.track import CameraTrack, make_track
 from bodycap_batch.merging.main_map import candidate_main_maps
 from bodycap_batch.merging.map_alignment import align
 from bodycap_batch.merging.map_alignment.align import align_cameras
-from bodycap_batch.merging.map_alignment.scale_sources import (
-    StatedConstraints,
-    scale_from_walked_floor,
-    stated_constraints,
-)
 from bodycap_batch.merging.map_alignment.similarity_refinement import MapAlignmentProblem
+from bodycap_batch.merging.map_alignment.walked_floor import (
+    scale_from_walked_floor,
+)
 from bodycap_batch.merging.world.vertical import Vertical, VerticalHypothesis
-from bodycap_batch.model.geometry import make_transform, so3_exp
+from bodycap_batch.model.geometry import Similarity, make_transform, so3_exp
 from bodycap_batch.synthetic import SynthOptions
 from tests.bench.joining import SPLITS, _off
 from tests.bench.posed import posed
@@ -43,7 +42,7 @@ def short():
 
 
 def _direction(up, source="map"):
-    return Vertical(up, source, None, 0.0)
+    return Vertical(up=up, source=source, sigma_deg=0.0, body_off_deg=None, share=0.0)
 
 
 def _asked(capture, options, points=None, off=1.1, up="map"):
@@ -56,7 +55,9 @@ def _asked(capture, options, points=None, off=1.1, up="map"):
     body = ScaleSource(name="body", scale=off / gauge.scale, sigma_log=0.1)
     seen = make_track(inputs, trunk, index), _direction(gauge.rotation @ UP, up) if up else None
     points = np.zeros((0, 3)) if points is None else gauge.apply(points)
-    stated = stated_constraints(inputs, options, trunk.gauge).scales
+    stated = stated_constraints(
+        inputs, options, {trunk.gauge: Similarity(1.0, np.eye(3), np.zeros(3))}, skip_unusable=True
+    ).scales
     floor = scale_from_walked_floor(inputs, *seen, body, points)
     return [
         (each.name, each.scale * gauge.scale, each.sigma_log)
@@ -154,10 +155,10 @@ def test_the_alignment_gets_the_stated_vertical_and_the_roll_of_the_trunks_camer
         received.append(mounts["torso"])
         raise EstimationError("enough")
 
-    monkeypatch.setattr(align, "stated_constraints", lambda *_: StatedConstraints(verticals=(lying,)))
+    monkeypatch.setattr(align, "stated_constraints", lambda *_, **__: StatedConstraints(verticals=(lying,)))
     monkeypatch.setattr(align, "reference_camera_roll", way_up)
     monkeypatch.setattr(align, "CalibrationGraph", calibration)
-    main, further = candidate_main_maps(short.inputs)[0]
+    main, further = candidate_main_maps(short.inputs, ())[0]
     assert "enough" in align_cameras(short.inputs, main, further[:1], lambda: None).unused[further[0].camera]
     assert received[0] == (lying,)
     usual = short.inputs.mount_of("torso").joint_from_cam
@@ -187,7 +188,7 @@ class _Strained(MapAlignmentProblem):
 
 def test_a_stated_scale_permits_an_alignment_with_inconsistent_scales(short, monkeypatch):
     monkeypatch.setattr(align, "MapAlignmentProblem", _Strained)
-    main, further = candidate_main_maps(short.inputs)[0]
+    main, further = candidate_main_maps(short.inputs, ())[0]
     refused, placed = (
         align_cameras(short.inputs, main, further[:1], lambda: None, options).unused
         for options in (MergeOptions(), _distance(short, "torso"))
@@ -211,7 +212,7 @@ def test_the_stated_scale_is_a_residual_of_the_problem():
 @pytest.mark.slow
 def test_a_known_scale_improves_the_alignment_of_palms():
     capture = _drawn(1000 / 30)
-    main, further = candidate_main_maps(capture.inputs)[0]
+    main, further = candidate_main_maps(capture.inputs, ())[0]
     off = []
     for options in (MergeOptions(), _distance(capture, "torso")):
         together = align_cameras(capture.inputs, main, further, lambda: None, options)

@@ -9,8 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from bodycap_batch.merging.cameras.track import CameraTrack
-from bodycap_batch.merging.graph.joint_covariance import JointUncertainty
-from bodycap_batch.merging.graph.motion_graph import MotionSolution
+from bodycap_batch.merging.graph.motion_graph import JointUncertainty, MotionSolution
 from bodycap_batch.merging.graph.windows import (
     WINDOW_TICKS,
     max_window_ticks,
@@ -66,12 +65,9 @@ class _ShiftedSolution:
         pose = np.eye(4)
         pose[:3, :3] = so3_exp(np.array([0.0, 0.0, 0.3 * self._number]))
         pose[0, 3] = 0.08 * self._number
-        none = {track.camera: np.zeros(len(track.times_ns)) for track in self._seen}
         return MotionSolution(
             world_from_bone=np.tile(pose, (len(self._ticks), 2, 1, 1)),
-            residual_m=none,
-            residual_rad=none,
-            weights=none,
+            residuals={},
             world_from_cam={track.camera: np.tile(pose, (len(track.times_ns), 1, 1)) for track in self._seen},
             iterations=1,
             errors={"joints": 1.0},
@@ -109,7 +105,7 @@ def test_blended_solutions_do_not_jump_at_a_boundary():
         there = np.searchsorted(TICKS, track.times_ns)
         assert_allclose(blended.world_from_cam[track.camera], poses[there, 0], atol=1e-12)
         # The residuals are those of the blended poses.
-        assert_allclose(blended.residual_m[track.camera], poses[there, 0, 0, 3], atol=1e-12)
+        assert_allclose(blended.residuals[track.camera].distance_m, poses[there, 0, 0, 3], atol=1e-12)
 
 
 @pytest.mark.parametrize(("fps", "repeats"), [(30, 1.4), (60, 1.5), (120, 1.8), (240, 2.0)])
