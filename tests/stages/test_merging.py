@@ -356,7 +356,7 @@ def test_a_lost_torso_is_refused_with_numbers(walk, context):
 @pytest.mark.parametrize("kept", [6, pytest.param(24, marks=pytest.mark.slow)])
 def test_the_head_is_the_reference_if_the_torso_is_lost(tmp_path, kept):
     cameras = ("torso", "head", "left_palm", "right_palm")
-    capture = posed(SynthOptions(seconds=8.0, cameras=cameras, seed=5, poses_only=True))
+    capture = posed(SynthOptions(seconds=5.0, cameras=cameras, seed=5, poses_only=True))
     trajectories = list(capture.inputs.trajectories)
     seen = np.flatnonzero(trajectories[0].localised)[:kept]
     lost = np.setdiff1d(np.arange(len(trajectories[0].status)), seen)
@@ -378,7 +378,7 @@ def test_the_head_is_the_reference_if_the_torso_is_lost(tmp_path, kept):
     joints = [roles.index(role) for role in ("Head", "LeftHand", "RightHand", "LeftArm")]
     placed = align_points(mine[:, joints].reshape(-1, 3), true[:, joints].reshape(-1, 3), with_scale=False)
     off = np.linalg.norm(placed.apply(mine[:, joints]) - true[:, joints], axis=-1)
-    # Eight seconds with nominal mounts state some 6 % of scale and 3 cm of mount: of an arm's length, 5 cm.
+    # Five seconds with nominal mounts state some 6 % of scale and 3 cm of mount: of an arm's length, 5 cm.
     assert off.mean() < 0.08
     assert result.world_from_map["map-0"].scale * capture.gauges["map-0"].scale == pytest.approx(
         1.0, abs=2.0 * result.report.scale.relative_sigma
