@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from itertools import product
 from pathlib import Path
 
@@ -28,6 +29,7 @@ class Room:
     faces: np.ndarray
 
     @staticmethod
+    @cache
     def make(seed: int = 0) -> Room:
         """Return a room with patterns of blobs at several scales, different on every face."""
         rng = np.random.default_rng(seed)
@@ -43,25 +45,32 @@ class Room:
 
     def view(self, camera: Camera, world_from_cam: np.ndarray) -> np.ndarray:
         """Return a grey image (H,W) uint8 from a pose inside the room."""
-        column, row = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
-        rays = camera.unproject(np.column_stack([column.ravel(), row.ravel()]))
-        ray = np.column_stack([rays, np.ones(len(rays))]) @ world_from_cam[:3, :3].T
+        shape = (camera.height_px, camera.width_px)
+        rays = _rays(camera.model, camera.width_px, camera.height_px, tuple(camera.params.tolist()))
+        ray = rays @ world_from_cam[:3, :3].T
         centre = world_from_cam[:3, 3]
         with np.errstate(divide="ignore"):
-            distance = (np.sign(ray) * HALF_M - centre) / ray
-        axis = np.argmin(np.where(ray == 0, np.inf, distance), axis=1)
-        rows = np.arange(len(ray))
-        hit = centre + ray * distance[rows, axis][:, None]
-        face = 2 * axis + (ray[rows, axis] > 0)
-        others = np.array([[1, 2], [0, 2], [0, 1]])[axis]
-        at = (hit[rows[:, None], others] / HALF_M[others] + 1) * 0.5 * (TEXTURE_PX - 1)
-        shape = (camera.height_px, camera.width_px)
-        u, v = (value.reshape(shape) for value in at.astype(np.float32).T)
+            distance = np.where(ray == 0, np.inf, (np.sign(ray) * HALF_M - centre) / ray)
+        axis = np.argmin(distance, axis=1)
+        hit = centre + ray * distance.min(axis=1, keepdims=True)
+        at = ((hit / HALF_M + 1) * 0.5 * (TEXTURE_PX - 1)).astype(np.float32).T.reshape(3, *shape)
         image = np.zeros(shape, np.float32)
-        for number in np.unique(face):
-            seen = cv2.remap(self.faces[number], u, v, cv2.INTER_LINEAR)
-            image = np.where(face.reshape(shape) == number, seen, image)
+        for number, texture in enumerate(self.faces):
+            across, down = at[[each for each in range(3) if each != number // 2]]
+            is_seen = ((axis == number // 2) & ((ray[:, number // 2] > 0) == number % 2)).reshape(shape)
+            if is_seen.any():
+                image = np.where(is_seen, cv2.remap(texture, across, down, cv2.INTER_LINEAR), image)
         return np.clip(image, 0, 255).astype(np.uint8)
+
+
+@cache
+def _rays(model: str, width_px: int, height_px: int, params: tuple[float, ...]) -> np.ndarray:
+    """Return the lines of sight (N,3) of all pixels, row by row; z is 1."""
+    camera = Camera(model=model, width_px=width_px, height_px=height_px, params=np.array(params))
+    column, row = np.meshgrid(np.arange(width_px) + 0.5, np.arange(height_px) + 0.5)
+    return np.column_stack(
+        [camera.unproject(np.column_stack([column.ravel(), row.ravel()])), np.ones(row.size)]
+    )
 
 
 def look(forward_yaw_rad: float, pitch_rad: float = 0.0) -> np.ndarray:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 
@@ -50,7 +52,8 @@ def write_video(
         movflags: Option of the muxer of MP4 and MOV, for example ``frag_keyframe+empty_moov``.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w", options={"movflags": movflags} if movflags else {}) as container:
+    muxing = {"movflags": movflags} if movflags else {}
+    with _kept_priority(), av.open(str(path), "w", options=muxing) as container:
         container.metadata.update(metadata or {})
         options = (
             {}
@@ -72,6 +75,20 @@ def write_video(
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
     return path
+
+
+@contextmanager
+def _kept_priority() -> Iterator[None]:
+    """Keep the priority of this process: SVT-AV1 gives its caller the highest one if that is root."""
+    if not hasattr(os, "sched_getscheduler"):
+        yield
+        return
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        if os.sched_getscheduler(0) != policy:
+            os.sched_setscheduler(0, policy, parameters)
 
 
 def write_tone(path: Path, seconds: float = 0.2) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,9 +61,26 @@ def run(inputs: ExportInputs, **options: Any) -> dict[str, Any]:
     return dict(json.loads((inputs.out_dir / "metrics.json").read_text()))
 
 
-def test_all_files_are_there(tmp_path: Path) -> None:
-    inputs = inputs_of(tmp_path)
-    files = export_results(inputs, ExportOptions(), StageContext(work_dir=tmp_path))
+@dataclass(frozen=True)
+class Exported:
+    """What an export with default options was given, and what it wrote."""
+
+    inputs: ExportInputs
+    files: tuple[Path, ...]
+    metrics: dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
+    """An export with default options. No test changes its files."""
+    inputs = inputs_of(tmp_path_factory.mktemp("exported"))
+    files = export_results(inputs, ExportOptions(), StageContext(work_dir=inputs.out_dir.parent))
+    assert not list(inputs.out_dir.rglob(".*"))
+    return Exported(inputs, tuple(files), json.loads((inputs.out_dir / "metrics.json").read_text()))
+
+
+def test_all_files_are_there(exported: Exported) -> None:
+    inputs, files = exported.inputs, exported.files
     expected = {
         "map.ply",
         "map_1.ply",
@@ -84,18 +101,15 @@ def test_all_files_are_there(tmp_path: Path) -> None:
     assert {str(p.relative_to(inputs.out_dir)) for p in inputs.out_dir.rglob("*") if p.is_file()} == expected
 
 
-def test_two_exports_are_the_same_bytes(tmp_path: Path) -> None:
-    for name in ("first", "second"):
-        run(inputs_of(tmp_path / name))
-    for path in (tmp_path / "first" / "out").rglob("*"):
-        if path.is_file():
-            other = tmp_path / "second" / path.relative_to(tmp_path / "first")
-            assert path.read_bytes() == other.read_bytes(), path.name
+def test_two_exports_are_the_same_bytes(exported: Exported, tmp_path: Path) -> None:
+    again = inputs_of(tmp_path)
+    run(again)
+    for name in exported.files:
+        assert (again.out_dir / name).read_bytes() == (exported.inputs.out_dir / name).read_bytes(), name
 
 
-def test_map_and_paths_share_the_world(tmp_path: Path) -> None:
-    inputs = inputs_of(tmp_path)
-    run(inputs)
+def test_map_and_paths_share_the_world(exported: Exported) -> None:
+    inputs = exported.inputs
     cloud = read_ply(inputs.out_dir / "map.ply")
     points = len(inputs.maps[0].points)
     np.testing.assert_allclose(cloud.points[:points], WORLD_FROM_MAP.apply(inputs.maps[0].points))
@@ -106,9 +120,8 @@ def test_map_and_paths_share_the_world(tmp_path: Path) -> None:
     assert len(np.unique(cloud.colors[points:], axis=0)) == len(CAMERAS)
 
 
-def test_trajectories_hold_localised_frames_on_the_cameras_own_clock(tmp_path: Path) -> None:
-    inputs = inputs_of(tmp_path)
-    run(inputs)
+def test_trajectories_hold_localised_frames_on_the_cameras_own_clock(exported: Exported) -> None:
+    inputs = exported.inputs
     assert inputs.merge is not None
     for path in inputs.merge.trajectories:
         file = inputs.out_dir / "trajectories" / f"{path.camera}.tum"
@@ -118,9 +131,8 @@ def test_trajectories_hold_localised_frames_on_the_cameras_own_clock(tmp_path: P
         assert "world_from_camera" in file.read_text().splitlines()[1]
 
 
-def test_frames_table_has_every_frame_and_both_clocks(tmp_path: Path) -> None:
-    inputs = inputs_of(tmp_path)
-    run(inputs)
+def test_frames_table_has_every_frame_and_both_clocks(exported: Exported) -> None:
+    inputs = exported.inputs
     with open(inputs.out_dir / "frames.csv", newline="") as handle:
         rows = list(csv.DictReader(handle))
     assert len(rows) == 60 * len(CAMERAS)
@@ -132,9 +144,8 @@ def test_frames_table_has_every_frame_and_both_clocks(tmp_path: Path) -> None:
     assert (rows[0]["status"], rows[0]["reason"], rows[0]["error"]) == ("REGISTERED", "", "0.500")
 
 
-def test_metrics_hold_the_tables(tmp_path: Path) -> None:
-    inputs = inputs_of(tmp_path)
-    metrics = run(inputs)
+def test_metrics_hold_the_tables(exported: Exported) -> None:
+    inputs, metrics = exported.inputs, exported.metrics
     torso, total, scene = metrics["cameras"]["torso"], metrics["total"], inputs.maps[0]
     assert (torso["frames"], torso["frames_registered"]) == (60, 55)
     assert torso["coverage"] == pytest.approx(55 / 60)
@@ -162,15 +173,14 @@ def test_metrics_hold_the_tables(tmp_path: Path) -> None:
     assert metrics["mapping"] == {"initial_pairs": [["torso/1", "torso/5"]]}
 
 
-def test_metrics_say_which_joints_were_observed(tmp_path: Path) -> None:
-    joints = run(inputs_of(tmp_path))["motion"]["joints"]
+def test_metrics_say_which_joints_were_observed(exported: Exported) -> None:
+    joints = exported.metrics["motion"]["joints"]
     assert joints["LeftHand"] == {"role": "LeftHand", "observed": True, "observed_share": 1.0}
     assert joints["LeftUpLeg"] == {"role": "LeftUpLeg", "observed": False, "observed_share": 0.0}
 
 
-def test_motion_file_is_the_projected_motion(tmp_path: Path) -> None:
-    inputs = inputs_of(tmp_path)
-    metrics = run(inputs)
+def test_motion_file_is_the_projected_motion(exported: Exported) -> None:
+    inputs, metrics = exported.inputs, exported.metrics
     assert inputs.merge is not None
     motion = inputs.merge.motion
     model, back = read_bvh(inputs.out_dir / "motion.bvh")
@@ -184,10 +194,9 @@ def test_motion_file_is_the_projected_motion(tmp_path: Path) -> None:
     assert metrics["motion"]["gap"]["cameras"]["torso"]["p95_m"] < 0.02
 
 
-def test_the_body_stands_upright_in_the_file(tmp_path: Path) -> None:
+def test_the_body_stands_upright_in_the_file(exported: Exported) -> None:
     """In the file, Y is up, the left hand starts on +X of the right one, the feet are on the floor; cm."""
-    inputs = inputs_of(tmp_path)
-    run(inputs)
+    inputs = exported.inputs
     text = (inputs.out_dir / "motion.bvh").read_text()
     first = list(map(float, text.splitlines()[text.splitlines().index("MOTION") + 3].split()))
     assert 90 < first[1] < 97

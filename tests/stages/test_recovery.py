@@ -199,8 +199,15 @@ def context(tmp_path: Path) -> StageContext:
     return StageContext(work_dir=tmp_path, threads=1)
 
 
-def test_lost_frames_are_found_where_they_were(pictures: list[np.ndarray], context: StageContext) -> None:
-    path = _recovered(_map(pictures), pictures, context)
+@pytest.fixture(scope="module")
+def recovered(pictures: list[np.ndarray], tmp_path_factory: pytest.TempPathFactory) -> Trajectory:
+    """The path with its lost frames found again."""
+    context = StageContext(work_dir=tmp_path_factory.mktemp("recovered"), threads=1)
+    return _recovered(_map(pictures), pictures, context)
+
+
+def test_lost_frames_are_found_where_they_were(recovered: Trajectory) -> None:
+    path = recovered
     assert path.localised.all()
     off_m = np.linalg.norm(path.gauge_from_cam[:, :3, 3] - PATH[:, :3, 3], axis=1)[list(LOST)]
     # A pixel of noise on 50 points of walls 2.5 m off leaves a centre open by about a centimetre.
@@ -210,10 +217,8 @@ def test_lost_frames_are_found_where_they_were(pictures: list[np.ndarray], conte
     assert (sigma_m > 1e-3).all()
 
 
-def test_poses_from_tracking_move_by_less_than_their_sigma(
-    pictures: list[np.ndarray], context: StageContext
-) -> None:
-    path, before = _recovered(_map(pictures), pictures, context), _tracked().trajectory
+def test_poses_from_tracking_move_by_less_than_their_sigma(recovered: Trajectory) -> None:
+    path, before = recovered, _tracked().trajectory
     known = before.localised
     off_m = np.linalg.norm((path.gauge_from_cam - before.gauge_from_cam)[known, :3, 3], axis=1)
     assert off_m.max() < 1e-3  # the sigma of an axis
@@ -455,6 +460,7 @@ def test_progress_grows_over_the_passes_until_nothing_is_left(
 def test_the_turn_between_two_frames_is_measured_once_for_all_passes(
     monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray], context: StageContext
 ) -> None:
+    monkeypatch.setitem(globals(), "LOST", range(20, 23))
     measured: list[object] = []
     measure = Propagation._turn_of_pictures
 
@@ -557,6 +563,7 @@ def test_a_wrong_pose_next_to_a_lost_interval_is_searched_again(
 def test_a_second_thread_changes_nothing(
     monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray], tmp_path: Path
 ) -> None:
+    monkeypatch.setitem(globals(), "LOST", range(20, 23))
     scene, end = _map(pictures), LOST[0] - 1
     found = _with_tracks(_tracked(), scene, end)
     inliers = found.trajectory.inliers.copy()
@@ -675,15 +682,19 @@ def test_poses_from_tracking_among_misplaced_keyframes_are_withdrawn_before_the_
     np.testing.assert_array_equal(searched[0][1], [29, 30, 31])
 
 
-def _searched_frame(
-    pictures: list[np.ndarray], context: StageContext
+@pytest.fixture(scope="module")
+def searched_frame(
+    pictures: list[np.ndarray], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[GuidedLocaliser, SearchFrame, PoseEstimate]:
-    """Return a localiser, a lost frame, and the pose that is found in it from its true pose."""
+    """A localiser, a lost frame, and the pose that is found in it from its true pose."""
     path = _tracked().trajectory
     capture = cast(Capture, _Capture(_Video(pictures)))
-    localiser = recover.make_localiser(
-        _map(pictures), capture, path, RegistrationOptions(), context, rotation=None
-    )
+    context = StageContext(work_dir=tmp_path_factory.mktemp("searched"), threads=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recover, "estimate_exposure", lambda *_: 0.0)
+        localiser = recover.make_localiser(
+            _map(pictures), capture, path, RegistrationOptions(), context, rotation=None
+        )
     frame = SearchFrame(21, Pyramid.build(pictures[21]), -1)
     found = localiser.relocalise(frame, invert(PATH[21]), NeighbourPose(invert(PATH[20])))
     assert found is not None
@@ -691,19 +702,19 @@ def _searched_frame(
 
 
 def test_a_pose_from_true_matches_does_not_depend_on_its_start(
-    monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray], context: StageContext
+    searched_frame: tuple[GuidedLocaliser, SearchFrame, PoseEstimate],
 ) -> None:
-    monkeypatch.setattr(recover, "estimate_exposure", lambda *_: 0.0)
-    localiser, frame, found = _searched_frame(pictures, context)
+    localiser, frame, found = searched_frame
     assert localiser.start_dependence(frame, found, NeighbourPose(invert(PATH[20]))) < 0.1
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.9, None])
 def test_the_covariance_contains_the_error_that_a_search_leaves_of_its_start(
-    monkeypatch: pytest.MonkeyPatch, pictures: list[np.ndarray], context: StageContext, share: float | None
+    monkeypatch: pytest.MonkeyPatch,
+    searched_frame: tuple[GuidedLocaliser, SearchFrame, PoseEstimate],
+    share: float | None,
 ) -> None:
-    monkeypatch.setattr(recover, "estimate_exposure", lambda *_: 0.0)
-    localiser, frame, found = _searched_frame(pictures, context)
+    localiser, frame, found = searched_frame
     centre = invert(found.cam_from_map)[:3, 3]
 
     def search(_localiser: object, _frame: object, pose: np.ndarray, _neighbour: object) -> object:

@@ -1,4 +1,4 @@
-"""A take in which the strap of a camera slips: found, solved as another mount, and stated in the report."""
+"""A take in which the straps of two cameras slip: found, solved as other mounts, and stated in the report."""
 
 from __future__ import annotations
 
@@ -22,24 +22,30 @@ from tests.bench.simulation import PALMS
 from tests.bench.slips import Take, joint_errors, slip_ns
 
 AXIS = np.array([2.0, -1.0, 2.0]) / 3.0
-CAMERA = "left_palm"
+CAMERA, OTHER = "left_palm", "right_palm"
 
 
 @pytest.fixture(scope="module")
 def take() -> Take:
     capture = posed(
         SynthOptions(
-            poses_only=True, seconds=5.0, cameras=PALMS, seed=4, walk="gait", pose_sigma_m=0.001,
+            poses_only=True, seconds=3.0, cameras=PALMS, seed=4, walk="gait", pose_sigma_m=0.001,
             pose_sigma_deg=0.03,
         )
     )  # fmt: skip
     step = make_transform(so3_exp(np.radians(15.0) * AXIS), 0.01 * AXIS)
-    return Take(name="take", capture=capture, camera=CAMERA, frame=80, step=step, kind="turn", noise_m=0.001)
+    return Take(name="take", capture=capture, camera=CAMERA, frame=45, step=step, kind="turn", noise_m=0.001)
 
 
 @pytest.fixture(scope="module")
 def slipped(take: Take) -> MergeResult:
-    return merge_trajectories(take.slipped(1), MergeOptions(), StageContext(work_dir=Path()))
+    other = replace(take, camera=OTHER, frame=55)
+    (path,) = (each for each in other.slipped(1).trajectories if each.camera == OTHER)
+    inputs = take.slipped(1)
+    paths = tuple(path if each.camera == OTHER else each for each in inputs.trajectories)
+    return merge_trajectories(
+        replace(inputs, trajectories=paths), MergeOptions(), StageContext(work_dir=Path())
+    )
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +60,10 @@ def test_an_untouched_take_has_no_slip(untouched: MergeResult) -> None:
 
 def test_the_report_states_the_slip(take: Take, slipped: MergeResult) -> None:
     assert slipped.report.slipped_mounts is not None
-    assert set(slipped.report.slipped_mounts.cameras) == {CAMERA}
+    assert set(slipped.report.slipped_mounts.cameras) == {CAMERA, OTHER}
     found = slipped.report.slipped_mounts.cameras[CAMERA]
     assert found.at_s == pytest.approx(1e-9 * (slip_ns(take) - slipped.start_ns), abs=1.0 / 30.0)
-    # 4 sigma per axis; the scale of a take of five seconds is known to some per cent of 1 cm.
+    # 4 sigma per axis; the scale of a take of three seconds is known to some per cent of 1 cm.
     assert found.turned_deg == pytest.approx(15.0, abs=4.0 * found.sigma_deg)
     assert found.moved_m == pytest.approx(0.01, abs=4.0 * found.sigma_m)
     assert found.sigma_deg < 1.5
@@ -99,20 +105,3 @@ def test_a_slip_is_stored_with_its_mount(slipped: MergeResult, tmp_path: Path) -
             np.testing.assert_array_equal(one.slip.before_from_after, other.slip.before_from_after)
     values = slipped.report.to_dict()
     assert MergeReport.from_dict(json.loads(json.dumps(values))).to_dict() == values
-
-
-def test_two_mounts_that_slip_are_both_named(take: Take) -> None:
-    inputs = take.slipped(1)
-    other = replace(take, camera="right_palm", frame=100)
-    both = replace(
-        inputs,
-        trajectories=tuple(
-            next(each for each in other.slipped(1).trajectories if each.camera == "right_palm")
-            if path.camera == "right_palm"
-            else path
-            for path in inputs.trajectories
-        ),
-    )
-    result = merge_trajectories(both, MergeOptions(), StageContext(work_dir=Path()))
-    assert result.report.slipped_mounts is not None
-    assert set(result.report.slipped_mounts.cameras) == {"left_palm", "right_palm"}

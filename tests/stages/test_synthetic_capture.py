@@ -22,7 +22,7 @@ from bodycap_batch.model.skeleton_presets import load_skeleton, rest_positions
 from bodycap_batch.synthetic import SynthOptions, synthesise
 from bodycap_batch.synthetic.clocks import true_clocks
 
-TINY = {"width": 64, "height": 48, "seconds": 0.3, "cameras": ("torso", "left_palm")}
+TINY = {"width": 64, "height": 48, "seconds": 0.3, "cameras": ("torso", "left_palm"), "furnished": False}
 
 
 def _make(folder, progress=None, cancelled=None, **values):
@@ -308,6 +308,7 @@ def test_blur_rolling_shutter_body_and_fisheye_together(tmp_path):
         exposure_s=0.015,
         rolling_shutter_s=0.02,
         body_in_view=True,
+        furnished=True,
         repeated_posters=True,
     )
     frames = _frames(folder / "right_palm.mp4")

@@ -56,9 +56,12 @@ def capture(folder, *names, **offsets):
     return CaptureConfig(cameras=tuple(cameras))
 
 
+NAMES = ("left_palm", "torso", "head", "right_palm", "left_thigh")
+
+
 @pytest.fixture(scope="module")
 def estimates(folder):
-    return estimate_clocks(capture(folder, "left_palm", "torso", "head", "right_palm", "left_thigh"))
+    return estimate_clocks(capture(folder, *NAMES))
 
 
 def test_offsets_are_relative_to_the_torso(estimates):
@@ -200,15 +203,12 @@ def test_one_camera_has_nothing_to_compare(folder, tmp_path, capsys):
     assert "only one camera" in capsys.readouterr().err
 
 
-NAMES = ("torso", "left_palm", "head", "right_palm", "left_thigh")
-
-
 def decided(spec):
     return decide_clocks(spec, estimate_clocks(spec)).cameras
 
 
-def test_an_unstated_clock_comes_from_the_sound_or_is_unknown(folder):
-    clocks = decided(capture(folder, *NAMES))
+def test_an_unstated_clock_comes_from_the_sound_or_is_unknown(folder, estimates):
+    clocks = decide_clocks(capture(folder, *NAMES), estimates).cameras
     assert clocks["left_palm"].source == "sound"
     assert clocks["left_palm"].offset_s == pytest.approx(PALM_S, abs=WAY_S)
     for name in ("right_palm", "left_thigh"):
@@ -217,13 +217,14 @@ def test_an_unstated_clock_comes_from_the_sound_or_is_unknown(folder):
 
 
 def test_offsets_are_on_the_clock_that_the_reference_camera_states(folder):
-    clocks = decided(capture(folder, *NAMES, torso=100.0))
+    clocks = decided(capture(folder, "torso", "left_palm", torso=100.0))
     assert clocks["torso"].offset_s == 100.0
     assert clocks["left_palm"].offset_s == pytest.approx(100.0 + PALM_S, abs=WAY_S)
 
 
 def test_a_stated_clock_is_used_and_its_contradiction_noted(folder):
-    clocks = decided(capture(folder, *NAMES, left_palm=-PALM_S, head=HEAD_S + 0.01, left_thigh=0.3))
+    stated = {"left_palm": -PALM_S, "head": HEAD_S + 0.01, "left_thigh": 0.3}
+    clocks = decided(capture(folder, "torso", *stated, **stated))
     assert (clocks["left_palm"].source, clocks["left_palm"].offset_s) == ("stated", -PALM_S)
     assert clocks["left_palm"].is_contradicted
     assert "with the sign turned the sound agrees" in clocks["left_palm"].notes[0]
@@ -232,7 +233,8 @@ def test_a_stated_clock_is_used_and_its_contradiction_noted(folder):
 
 
 def test_common_clocks_need_no_sound(folder):
-    spec = capture(folder, *NAMES, **dict.fromkeys(NAMES, 0.0)).model_copy(update={"clocks": "common"})
+    names = ("torso", "left_palm", "left_thigh")
+    spec = capture(folder, *names, **dict.fromkeys(names, 0.0)).model_copy(update={"clocks": "common"})
     clocks = decided(spec)
     assert {clock.source for clock in clocks.values()} == {"common"}
     assert clocks["left_palm"].is_contradicted

@@ -313,7 +313,7 @@ def test_any_text_is_a_job_or_a_job_error(tmp_path_factory: pytest.TempPathFacto
     assert named in {str(path.resolve()), str(path.resolve().parent)}
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     st.recursive(
         st.none() | st.booleans() | st.floats(-1e300, 1e300) | st.integers() | st.text(max_size=5),

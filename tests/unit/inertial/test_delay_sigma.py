@@ -9,7 +9,7 @@ from bodycap_batch.inertial import align_sensor
 from bodycap_batch.model.geometry import make_transform, so3_exp
 from tests.inertial import Sensor, solved
 
-SEEDS = 10
+SEEDS = 6
 
 
 class Dancer:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -31,6 +32,12 @@ def _lost(gap_frames: int, first: int = 60, every: int = 70) -> list[int]:
     return [frame + start for start in range(first, 330 - gap_frames, every) for frame in range(gap_frames)]
 
 
+@cache
+def _filled(gap_frames):
+    """Return the path of a hand with equal gaps, and what its sensor gives; no test changes them."""
+    return _used(Hand(1), Sensor(), _lost(gap_frames))
+
+
 def _used(hand, sensor, lost, options=ONLY_GAPS, seed=2):
     path = solved(hand, SECONDS, lost=lost, gauge_from_world=GAUGE, seed=seed)
     return path, use_sensor(path, sensor.samples(hand, SECONDS, seed), options)
@@ -48,7 +55,7 @@ def _errors(hand, found, frames, gauge=GAUGE):
 @pytest.mark.parametrize(("gap_frames", "most_m"), [(5, 0.006), (14, 0.01), (28, 0.025)])
 def test_gaps_are_filled_near_the_truth_and_within_their_sigmas(gap_frames, most_m):
     hand, lost = Hand(1), _lost(gap_frames)
-    path, used = _used(hand, Sensor(), lost)
+    path, used = _filled(gap_frames)
     found = used.trajectory
     assert used.camera.filled == len(lost)
     assert {found.status[frame] for frame in lost} == {FrameStatus.INERTIAL}
@@ -71,7 +78,7 @@ def test_a_spline_is_worse_by_far():
     from scipy.interpolate import CubicSpline
 
     hand, lost = Hand(1), _lost(28)
-    path, used = _used(hand, Sensor(), lost)
+    path, used = _filled(28)
     kept = path.localised
     spline = CubicSpline(path.seconds[kept], path.gauge_from_cam[kept, :3, 3])(path.seconds[lost])
     truth = GAUGE.apply_to_poses(hand.poses(path.seconds))[lost, :3, 3]
@@ -241,7 +248,7 @@ def test_the_derivatives_of_the_solver_lead_to_the_constants():
 
 
 def test_what_a_sensor_gives_is_stored_and_read_back(tmp_path):
-    _, used = _used(Hand(1), Sensor(), _lost(10))
+    _, used = _filled(14)
     write_dataclass(used.camera, tmp_path, "inertial")
     read = read_dataclass(InertialCamera, tmp_path, "inertial")
     assert read.figures() == used.camera.figures()

@@ -1,5 +1,7 @@
 """Options of drawn captures: less texture, identical parts of rooms, light, compression, hands in view."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from bodycap_batch.synthetic.wearer import Wearer
 SMALL = {"width": 64, "height": 48, "seconds": 8.0, "body_in_view": True, "mount_sigma_m": 0.01}
 
 
+@cache
 def _room(**options):
     surfaces = build_room((1.8, 1.5), 10.0, np.random.SeedSequence(1), SynthOptions(**options))
     return [surface for surface in surfaces if not surface.shines]

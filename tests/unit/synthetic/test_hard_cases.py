@@ -10,7 +10,7 @@ from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.room import HEIGHT_M, build_room
 from bodycap_batch.synthetic.wearer import Wearer
 
-SMALL = {"width": 64, "height": 48, "seconds": 5.0, "body_in_view": True}
+SMALL = {"width": 64, "height": 48, "seconds": 5.0, "body_in_view": True, "furnished": False}
 
 
 def _body_ratios(options, camera, times_s):

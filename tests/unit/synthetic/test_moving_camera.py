@@ -3,11 +3,27 @@
 import numpy as np
 import pytest
 
+from bodycap_batch.synthetic import making
 from bodycap_batch.synthetic.making import build_renderers, draw_subject
 from bodycap_batch.synthetic.options import SynthOptions
 
 EXPOSURE_S, READOUT_S = 0.012, 0.020
 FISHEYE = {"lens": "OPENCV_FISHEYE", "lens_params": (48.0, 48.0, 64.0, 40.0, 0.02, -0.005, 0.0, 0.0)}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _rooms():
+    """Build the room of all renderers once for each detail of its textures."""
+    built, build = {}, making.build_room
+
+    def build_once(extent_m, texels_per_m, *rest):
+        if texels_per_m not in built:
+            built[texels_per_m] = build(extent_m, texels_per_m, *rest)
+        return built[texels_per_m]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(making, "build_room", build_once)
+        yield
 
 
 def _options(**values):

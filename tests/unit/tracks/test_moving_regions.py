@@ -58,8 +58,25 @@ def tracks_with_hand(hand_m: float, motion: float = 1.0, half_side_m: float = 0.
     return tracks_of_views(LENS, views, rng)
 
 
-def test_a_chain_of_tracks_turns_as_the_camera_does() -> None:
-    tracks = tracks_with_hand(0.1)
+@pytest.fixture(scope="module")
+def tracks() -> PointTracks:
+    """Tracks of a hand that moves by itself before a camera that moves."""
+    return tracks_with_hand(0.08)
+
+
+@pytest.fixture(scope="module")
+def moving(tracks: PointTracks) -> BoolArray:
+    """Which of the tracks move by themselves."""
+    return find_moving_tracks(tracks, LENS, TIMES_NS)
+
+
+@pytest.fixture(scope="module")
+def regions(tracks: PointTracks, moving: BoolArray) -> BoolArray:
+    """Where the pictures show what moves by itself."""
+    return find_moving_regions(tracks, moving)
+
+
+def test_a_chain_of_tracks_turns_as_the_camera_does(tracks: PointTracks) -> None:
     time = np.arange(FRAMES) / FPS
     true = so3_exp(np.column_stack([0.1 * np.sin(3 * time), 0.2 * np.sin(2 * time), 0 * time]))
     chain = measure_rotation_chain(tracks, LENS, 0.01, np.arange(FRAMES))
@@ -74,8 +91,7 @@ def test_a_chain_of_tracks_turns_as_the_camera_does() -> None:
     assert rest.frames[-1] == len(frames) - 1
 
 
-def test_without_tracks_no_rotation_is_claimed() -> None:
-    tracks = tracks_with_hand(0.1)
+def test_without_tracks_no_rotation_is_claimed(tracks: PointTracks) -> None:
     blank = np.zeros((FRAMES, 1, 1), dtype=bool)
     blank[25:36] = True
     chain = measure_rotation_chain(tracks.outside(blank), LENS, 0.01, np.arange(FRAMES))
@@ -88,17 +104,13 @@ def seen_often(tracks: PointTracks) -> BoolArray:
     return np.bincount(tracks.track) > FPS
 
 
-def test_a_hand_is_found_before_a_camera_that_moves() -> None:
-    tracks = tracks_with_hand(0.08)
-    moving = find_moving_tracks(tracks, LENS, TIMES_NS)
+def test_a_hand_is_found_before_a_camera_that_moves(tracks: PointTracks, moving: BoolArray) -> None:
     judged = seen_often(tracks)
     assert moving[:HAND][judged[:HAND]].mean() > 0.9
     assert moving[HAND:][judged[HAND:]].mean() < 0.02
 
 
-def test_the_regions_follow_the_hand_and_leave_the_room() -> None:
-    tracks = tracks_with_hand(0.08)
-    regions = find_moving_regions(tracks, find_moving_tracks(tracks, LENS, TIMES_NS))
+def test_the_regions_follow_the_hand_and_leave_the_room(tracks: PointTracks, regions: BoolArray) -> None:
     assert regions.shape == (FRAMES, 30, 40)
     on_hand, in_room = [], []
     for frame in range(FRAMES):
@@ -127,9 +139,7 @@ def test_nothing_is_left_out_if_no_motion_has_most_of_the_picture() -> None:
     assert not find_moving_tracks(wild, LENS, TIMES_NS).any()
 
 
-def test_the_lens_is_found_without_the_hand() -> None:
-    tracks = tracks_with_hand(0.08)
-    regions = find_moving_regions(tracks, find_moving_tracks(tracks, LENS, TIMES_NS))
+def test_the_lens_is_found_without_the_hand(tracks: PointTracks, regions: BoolArray) -> None:
     found = estimate_lens(tracks.outside(regions), TIMES_NS)
     assert found is not None
     assert abs(np.log(found.lens.focal_px / LENS.focal_px)) < 0.05
