@@ -16,11 +16,10 @@ from bodycap_batch.inertial.gap_filling import constants_of_clip, fill_gaps
 from bodycap_batch.inertial.path_solving import solve_path
 from bodycap_batch.model.earth import GpsFixes
 from bodycap_batch.model.gravity import fit_gravity
-from bodycap_batch.model.inertial_camera import ForceWindows, InertialCamera, SensorRelation
+from bodycap_batch.model.inertial_camera import ForceWindows, InertialCamera
 from bodycap_batch.model.picture_turns import PictureTurns
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.telemetry.comparison import PictureGyroComparison
-from bodycap_batch.telemetry.gyro_fit import GyroFit
 from bodycap_batch.telemetry.picture_orientation import turns_of_pictures, unrecorded_turns
 from bodycap_batch.telemetry.streams import CameraTelemetry, GpsTrack
 
@@ -143,7 +142,7 @@ def use_sensor(
         source=telemetry.source,
         verdict=aligned.comparison.verdict,
         reason=aligned.comparison.reason,
-        relation=None if aligned.fit is None else _relation(aligned.fit),
+        relation=aligned.fit,
         windows=windows if options.gravity and windows is not None and len(windows.times_s) else None,
         filled=used.filled,
         refused=used.refused,
@@ -226,19 +225,4 @@ def _gps_fixes(track: GpsTrack) -> GpsFixes | None:
         latitude_longitude_deg=track.latitude_longitude_deg[usable],
         altitude_m=track.altitude_m[usable],
         sigma_m=np.maximum(sigma_m[usable], _SIGMA_PER_DILUTION_M),
-    )
-
-
-def _relation(fit: GyroFit) -> SensorRelation:
-    return SensorRelation(
-        delay_s=fit.delay_s,
-        delay_sigma_s=fit.delay_sigma_s,
-        drift=fit.drift,
-        drift_sigma=fit.drift_sigma,
-        cam_from_sensor=fit.cam_from_sensor,
-        rotation_sigma_rad=np.asarray(fit.rotation_sigma_rad),
-        bias_rad_s=fit.bias_rad_s,
-        bias_sigma_rad_s=np.asarray(fit.bias_sigma_rad_s),
-        r_squared=fit.r_squared,
-        pairs=fit.pairs,
     )

@@ -82,10 +82,10 @@ def _rates(
     gyro: Stream, fit: GyroFit, readout: tuple[float, float] = (float("nan"), float("inf"))
 ) -> GyroRates:
     """Return the samples in the axes and on the clock of the camera."""
-    delay_s = fit.delay_s + fit.drift * (gyro.times_s - fit.middle_s)
+    times_s, rate_rad_s = fit.in_camera(gyro)
     return GyroRates(
-        times_s=gyro.times_s - delay_s,
-        rate_rad_s=(gyro.values - fit.bias_rad_s) @ fit.cam_from_sensor.T,
+        times_s=times_s,
+        rate_rad_s=rate_rad_s,
         gaps_s=np.array(gyro.gaps_s).reshape(-1, 2) - fit.delay_s,
         readout_s=readout[0],
         readout_sigma_s=readout[1],
