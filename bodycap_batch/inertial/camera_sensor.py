@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from bodycap_batch.config.options import TelemetryOptions
-from bodycap_batch.core.arrays import BoolArray
 from bodycap_batch.inertial.alignment import SensorAlignment, align_sensor
 from bodycap_batch.inertial.clip_solver import ClipSolver
 from bodycap_batch.inertial.force_windows import force_windows
@@ -184,32 +183,13 @@ def _used_path(solver: ClipSolver, others: Sequence[ClipSolver], options: Teleme
     if not options.gaps:
         return _UsedPath(result, solved=int(moved.sum()))
     found = fill_gaps(solver.without(wrong), others)
-    inertial = found.trajectory.localised & ~found.trajectory.registered
-    refused = found.refused - int((wrong & ~inertial).sum())
+    refused = found.refused - int((wrong & ~found.filled).sum())
     return _UsedPath(
-        _with_frames(result, found.trajectory, inertial),
-        filled=int((inertial & ~wrong).sum()),
+        found.added_to(result),
+        filled=int((found.filled & ~wrong).sum()),
         refused=max(refused, 0),
         solved=int(moved.sum()),
-        replaced=int((inertial & wrong).sum()),
-    )
-
-
-def _with_frames(path: Trajectory, source: Trajectory, chosen: BoolArray) -> Trajectory:
-    """Return a trajectory in which the chosen frames (N,) are those of another one."""
-    if not chosen.any():
-        return path
-    status = [
-        new if is_chosen else old
-        for old, new, is_chosen in zip(path.status, source.status, chosen.tolist(), strict=True)
-    ]
-    return replace(
-        path,
-        gauge_from_cam=np.where(chosen[:, None, None], source.gauge_from_cam, path.gauge_from_cam),
-        covariance=np.where(chosen[:, None, None], source.covariance, path.covariance),
-        status=tuple(status),
-        inliers=np.where(chosen, source.inliers, path.inliers),
-        error_px=np.where(chosen, source.error_px, path.error_px),
+        replaced=int((found.filled & wrong).sum()),
     )
 
 
