@@ -124,7 +124,7 @@ def use_sensor(
     """
     own = _Prepared.of(pictures, telemetry)
     trajectory, aligned, windows = own.trajectory, own.aligned, own.windows
-    used = _UsedPath(trajectory)
+    used, frames = trajectory, dict[str, int]()
     if windows is not None and (options.gaps or options.smoothing):
         prepared = [_Prepared.of(*other) for other in others if other[0].gauge == trajectory.gauge]
         solver = own.solver(prepared)
@@ -134,7 +134,7 @@ def use_sensor(
                 for index, other in enumerate(prepared)
                 if (found := other.solver([own, *prepared[:index], *prepared[index + 1 :]])) is not None
             ]
-            used = _used_path(solver, around, options)
+            used, frames = _used_path(solver, around, options)
     camera = InertialCamera(
         camera=trajectory.camera,
         gauge=trajectory.gauge,
@@ -143,33 +143,23 @@ def use_sensor(
         reason=aligned.comparison.reason,
         relation=aligned.fit,
         windows=windows if options.gravity and windows is not None and len(windows.times_s) else None,
-        filled=used.filled,
-        refused=used.refused,
-        solved=used.solved,
-        replaced=used.replaced,
         gps=_gps_fixes(telemetry.gps) if options.gps and telemetry.gps is not None else None,
         turns=own.turns,
+        **frames,
     )
-    if used.trajectory is trajectory:
+    if used is trajectory:
         return UsedSensor(camera=camera, trajectory=pictures)
     exact = None if own.turns is None else own.turns.exact()
-    solved = used.trajectory if exact is None else exact.picture_path(used.trajectory)
+    solved = used if exact is None else exact.picture_path(used)
     return UsedSensor(camera=camera, trajectory=solved)
 
 
-@dataclass(frozen=True, slots=True)
-class _UsedPath:
-    """A trajectory after the sensor was used, and the number of frames as in `InertialCamera`."""
+def _used_path(
+    solver: ClipSolver, others: Sequence[ClipSolver], options: TelemetryOptions
+) -> tuple[Trajectory, dict[str, int]]:
+    """Return the trajectory with the poses that the sensor improved and added, and the numbers of frames.
 
-    trajectory: Trajectory
-    filled: int = 0
-    refused: int = 0
-    solved: int = 0
-    replaced: int = 0
-
-
-def _used_path(solver: ClipSolver, others: Sequence[ClipSolver], options: TelemetryOptions) -> _UsedPath:
-    """Return the trajectory with the poses that the sensor improved and added.
+    The names of the numbers are those of `InertialCamera`.
 
     A pose that contradicts the sensor is replaced like that of a lost frame. If that is not possible, it
     stays.
@@ -181,16 +171,15 @@ def _used_path(solver: ClipSolver, others: Sequence[ClipSolver], options: Teleme
         solved = solve_path(solver)
         moved, wrong, result = solved.moved, solved.wrong, solved.trajectory
     if not options.gaps:
-        return _UsedPath(result, solved=int(moved.sum()))
+        return result, {"solved": int(moved.sum())}
     found = fill_gaps(solver.without(wrong), others)
     refused = found.refused - int((wrong & ~found.filled).sum())
-    return _UsedPath(
-        found.added_to(result),
-        filled=int((found.filled & ~wrong).sum()),
-        refused=max(refused, 0),
-        solved=int(moved.sum()),
-        replaced=int((found.filled & wrong).sum()),
-    )
+    return found.added_to(result), {
+        "filled": int((found.filled & ~wrong).sum()),
+        "refused": max(refused, 0),
+        "solved": int(moved.sum()),
+        "replaced": int((found.filled & wrong).sum()),
+    }
 
 
 def _gps_fixes(track: GpsTrack) -> GpsFixes | None:
