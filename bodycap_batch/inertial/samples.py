@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, set_array
+from bodycap_batch.core.arrays import BoolArray, FloatArray, interpolated, set_array
 from bodycap_batch.model.geometry import so3_exp, so3_log
 from bodycap_batch.model.gyro_rates import GyroOrientation
 from bodycap_batch.telemetry.gyro_fit import GyroFit
@@ -58,10 +58,7 @@ def samples_of_fit(gyro: Stream, accelerometer: Stream | None, fit: GyroFit) -> 
     if accelerometer is not None and len(accelerometer.times_s) > 1:
         gaps_s += accelerometer.gaps_s
         inside = (gyro.times_s >= accelerometer.times_s[0]) & (gyro.times_s <= accelerometer.times_s[-1])
-        for axis in range(3):
-            force[inside, axis] = np.interp(
-                gyro.times_s[inside], accelerometer.times_s, accelerometer.values[:, axis]
-            )
+        force[inside] = interpolated(gyro.times_s[inside], accelerometer.times_s, accelerometer.values)
     return InertialSamples(
         times_s=times_s,
         rate_rad_s=rate_rad_s,

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, interpolated
 from bodycap_batch.model.geometry import nearest_rotation
 from bodycap_batch.model.inertial_camera import SensorRelation
 from bodycap_batch.telemetry.picture_rotation import PictureRotation
@@ -105,11 +105,8 @@ class RateIntegral:
 
     def between(self, start_s: FloatArray, end_s: FloatArray) -> FloatArray:
         """Return the integrals (N,3), radians, between pairs of times."""
-        out = np.empty((len(start_s), 3))
-        for axis in range(3):
-            column = self.total[:, axis]
-            out[:, axis] = np.interp(end_s, self.times_s, column) - np.interp(start_s, self.times_s, column)
-        return out
+        start, end = (interpolated(at_s, self.times_s, self.total) for at_s in (start_s, end_s))
+        return np.asarray(end - start)
 
 
 def fit_gyro(
