@@ -167,7 +167,6 @@ class _Filler:
         self._solver, self._others = solver, others
         self._times_s, self._known = solver.times_s, solver.known
         self._unit = np.repeat([1.0, solver.metres_per_unit], 3)
-        self._factors: dict[float, tuple[float, float] | None] = {}
         self._errors: dict[float, list[FloatArray]] = {}
 
     def gaps(self) -> Iterator[_Gap]:
@@ -250,10 +249,8 @@ class _Filler:
         None if there are too few stretches to hold out, or if the sensor does not describe the motion.
         """
         length_s = next((each for each in _LENGTHS_S if each >= length_s - _ROUNDING_S), _LENGTHS_S[-1])
-        if length_s not in self._factors:
-            own = self._own_factors(length_s)
-            self._factors[length_s] = self._factors_with_others(length_s) if own is None else own
-        return self._factors[length_s]
+        own = self._own_factors(length_s)
+        return self._factors_with_others(length_s) if own is None else own
 
     def _own_factors(self, length_s: float) -> tuple[float, float] | None:
         """Return the factors that the stretches of this camera give."""
@@ -292,7 +289,7 @@ class _Filler:
             inner = slice(gap.first - gap.start, gap.last - gap.start)
             held_out = slice(gap.first, gap.last)
             # The errors of the held-out poses are as much larger than stated as those beside them.
-            excess = (growth - 1.0) * self._solver.pose_covariance(held_out)
+            excess = (growth - 1.0) * self._solver.covariance[held_out]
             errors.append(
                 self._normalised_errors(
                     self._solver.trajectory.gauge_from_cam[held_out],

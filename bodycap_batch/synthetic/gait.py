@@ -250,8 +250,7 @@ class Walk:
         for side, leg_phase in (("Left", phase + np.pi), ("Right", phase)):
             self._leg(side, leg_phase, (stride * walk_weight, sidestep * walk_weight), out)
             self._arm(side, t_s, (stride * np.cos(leg_phase + np.pi), walk_weight), out)
-        identity = Rotation.identity(len(t_s))
-        return np.stack([out.get(name, identity).as_matrix() for name in self.skeleton.joints], axis=1)
+        return local_rotations(self.skeleton, out, len(t_s))
 
     def _t_pose(self, t_s: FloatArray) -> FloatArray:
         """Return the weight (T,) of the T-pose.
@@ -317,6 +316,12 @@ class Walk:
         if held["Ahead"]:
             shoulder = rotation_about("Z", np.full_like(t_s, -outward * held["Ahead"])) * shoulder
         out.update({f"{side}Shoulder": shoulder, **angles.rotations(side, walk_weight)})
+
+
+def local_rotations(skeleton: SkeletonModel, turns: Mapping[str, Rotation], count: int) -> FloatArray:
+    """Return the rotations parent_from_joint (T,J,3,3) at `count` times; without one, the identity."""
+    identity = Rotation.identity(count)
+    return np.stack([turns.get(name, identity).as_matrix() for name in skeleton.joints], axis=1)
 
 
 def _draw_path(length_s: float, rng: np.random.Generator) -> CubicSpline:

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.synthetic.foot_roll import FootShape, foot_rotation, shape_of, toe_pitch_deg
-from bodycap_batch.synthetic.gait import WalkStyle
+from bodycap_batch.synthetic.gait import WalkStyle, local_rotations
 from bodycap_batch.synthetic.gait_curves import (
     REFERENCE_M_S,
     hip_flexion_deg,
@@ -189,9 +189,7 @@ class StanceWalk:
         self._trunk(turns, pelvis, out)
         for number, side in enumerate(_SIDES):
             self._arm(side, t_s, self._swings(t_s)[:, 2 * number : 2 * number + 2], out)
-        identity = Rotation.identity(len(t_s))
-        local = np.stack([out.get(name, identity).as_matrix() for name in self.skeleton.joints], axis=1)
-        return root, local
+        return root, local_rotations(self.skeleton, out, len(t_s))
 
     def contacts(self, start_s: float, end_s: float) -> dict[str, FloatArray]:
         """Return the stances (N,2) of each foot, by side: heel strike and toe off, seconds.
