@@ -294,7 +294,7 @@ class Walk:
         forth, walk_weight = swing
         held, ahead = self._style.held(side), self._arms_ahead
         wave = {part: self._oscillations[side + part](t_s) for part in _WAVING_PARTS}
-        degrees = {
+        degrees: dict[str, FloatArray] = {
             "flexion": 4.0 + held["Arm"] + 11.0 * forth + wave["Arm"] + 25.0 * ahead,
             "abduction": 10.0 + held["Out"] + wave["Out"],
             "elbow": 24.0 + held["Elbow"] + 7.0 * forth + wave["Elbow"] + 60.0 * ahead,
