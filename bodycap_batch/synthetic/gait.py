@@ -40,8 +40,10 @@ _LAP = np.array(
 """Positions on one lap. Columns: time (seconds); x and y (metres from the room's middle); direction of the
 face (degrees from +x, counter-clockwise). The lap starts with steps to the right while the person faces a
 wall, because a map is easy to initialise from sideways movement."""
-_TURN_WAVES = ((0.02, 1.1, 1.0), (0.02, 0.9, 1.0), (75.0, 2 * np.pi, 5.0))
-_STILL_WAVES = ((0.003, 1.3, 1.0), (0.003, 0.9, 1.0), (0.4, 0.7, 1.0))
+_TURN_WAVES, _STILL_WAVES = (
+    ((0.02, 1.1, 1.0), (0.02, 0.9, 1.0), (75.0, 2 * np.pi, 5.0)),
+    ((0.003, 1.3, 1.0), (0.003, 0.9, 1.0), (0.4, 0.7, 1.0)),
+)
 """Motion of a person who rotates on the spot, and of one who stands still, along x, y (m) and about the
 vertical (degrees): amplitude, phase (radians) in a period, and period (s)."""
 _STILL_NOD_DEG = 22.0
@@ -51,8 +53,6 @@ _STILL_PARTS, _STILL_SHARE, _STILL_ARMS_AHEAD = ("Bend", "Lean", "Turn", "Look",
 are ahead. Evidence: none."""
 _ARM_PARTS = ("Lift", "Ahead", "Arm", "Out", "Spin", "Elbow", "Twist")
 """Names of the angles of an arm's posture, which `WalkStyle.posture` explains."""
-_REACH_LIFT_DEG = 5.0
-"""Rise of the shoulder girdle of an arm that reaches out, degrees."""
 _WAVING_PARTS = ("Arm", "Out", "Elbow", "Twist", "Wrist", "Radial")
 """Names of the angles of an arm that oscillate slowly."""
 _SAMPLE_HZ = 50.0
@@ -309,7 +309,7 @@ class Walk:
                 weight = reach.weight(t_s)
                 for name, extra in reach.degrees.items():
                     degrees[name] = degrees[name] + weight * extra
-                lift = lift + weight * _REACH_LIFT_DEG
+                lift = lift + weight * 5.0
         angles, lift = self._style.pressed(side, ArmAngles(**degrees), lift, t_s)
         outward = 1.0 if side == "Left" else -1.0
         shoulder = rotation_about("Y", -outward * (walk_weight * lift + held["Lift"]))
