@@ -21,7 +21,7 @@ from bodycap_batch.config.bounds import (
 )
 from bodycap_batch.config.calibration import Calibration
 from bodycap_batch.config.lens_profiles import NAME_SEPARATOR, profiles_named
-from bodycap_batch.config.mounts import NOT_WORN, REFERENCE_ROLES, mount_of, role_of_segment
+from bodycap_batch.config.mounts import NOT_WORN, mount_of, reference_index, role_of_segment
 from bodycap_batch.config.options import (
     ExportOptions,
     KeyframeOptions,
@@ -307,11 +307,7 @@ class CaptureConfig(Options):
 
         It is the torso's camera; without one, the first camera.
         """
-        for role in REFERENCE_ROLES:
-            for camera in self.cameras:
-                if camera.role == role:
-                    return camera
-        return self.cameras[0]
+        return self.cameras[reference_index([camera.role for camera in self.cameras])]
 
     def worn(self) -> tuple[CameraConfig, ...]:
         """Return the cameras that are on the body."""

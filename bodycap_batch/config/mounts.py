@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 _CENTRAL_SPELLINGS = {
     "Spine1": ("torso", "chest", "sternum", "spine1", "upper_body"),
@@ -56,7 +56,7 @@ docs/decisions/places.md."""
 TRUNK_ROLES = ("Hips", "Spine", "Spine1", "Neck", "Head")
 """Roles of the bones of the trunk and the head."""
 
-REFERENCE_ROLES = ("Spine1", "Spine", "Hips")
+_REFERENCE_ROLES = ("Spine1", "Spine", "Hips")
 """Roles of the bones of a torso camera, the preferred one first. The common clock is that of this camera."""
 
 NOT_WORN = "none"
@@ -73,6 +73,15 @@ _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
 _GLUED_CAMERA = re.compile(r"(?:cam|camera|gopro)$")
 
 _QUALIFIER = re.compile(r"[_\- ]?(back|front|top|bottom|upper|lower|inner|outer|[0-9]+|[a-c])$")
+
+
+def reference_index(roles: Sequence[str | None]) -> int:
+    """Return the index of the camera whose clock is the common clock: on the torso, else the first camera.
+
+    Args:
+        roles: Role of the bone of each camera; None if it is unknown.
+    """
+    return next((roles.index(role) for role in _REFERENCE_ROLES if role in roles), 0)
 
 
 def _key(name: str) -> str:

@@ -80,6 +80,11 @@ def runs(mask: BoolArray) -> list[tuple[int, int]]:
     return [(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
 
 
+def interpolated(at: FloatArray, knots: FloatArray, values: FloatArray) -> FloatArray:
+    """Return values (T,K) at places (T,): linear interpolation of values (N,K) at increasing knots (N,)."""
+    return np.stack([np.interp(at, knots, column) for column in values.T], axis=1)
+
+
 def evenly_spaced(count: int, limit: int) -> IntArray:
     """Return at most `limit` evenly spaced indices of `count` items, without repetitions.
 

@@ -109,12 +109,8 @@ def evaluate_motion(estimate: Path, truth: Path, options: MotionOptions | None =
         JobError: A file is missing or malformed, or the motions have no common joints or times.
     """
     true_joints = _read_truth(Path(truth))
-    _, motion = read_bvh(estimate)
-    if motion is None:
-        raise JobError(
-            "the BVH file contains no frames", path=estimate, hint="give the motion.bvh of a results folder"
-        )
-    return _compare_joints(_joints_from_motion(motion), true_joints, options or MotionOptions())
+    joints = _read_joints(estimate, "give the motion.bvh of a results folder")
+    return _compare_joints(joints, true_joints, options or MotionOptions())
 
 
 def score_motion(estimate: Motion, truth: Motion, options: MotionOptions | None = None) -> MotionReport:
@@ -130,12 +126,7 @@ def score_motion(estimate: Motion, truth: Motion, options: MotionOptions | None 
 def _read_truth(path: Path) -> _JointPoses:
     """Read the true joint poses from a BVH or a .npz file."""
     if path.suffix.lower() != ".npz":
-        _, motion = read_bvh(path)
-        if motion is None:
-            raise JobError(
-                "the BVH file contains no frames", path=path, hint="give a BVH file that contains a motion"
-            )
-        return _joints_from_motion(motion)
+        return _read_joints(path, "give a BVH file that contains a motion")
     truth = read_joint_positions(path)
     shape = (*truth.x_in_world_m.shape, 3)
     return _JointPoses(
@@ -145,6 +136,14 @@ def _read_truth(path: Path) -> _JointPoses:
         rotations=np.broadcast_to(np.eye(3), shape),
         oriented=False,
     )
+
+
+def _read_joints(path: Path, hint: str) -> _JointPoses:
+    """Read the joint poses of a BVH file; without frames, an error has a hint."""
+    _, motion = read_bvh(path)
+    if motion is None:
+        raise JobError("the BVH file contains no frames", path=path, hint=hint)
+    return _joints_from_motion(motion)
 
 
 def _joints_from_motion(motion: Motion) -> _JointPoses:

@@ -12,7 +12,7 @@ from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.formats.atomic_files import atomic_replacement
 from bodycap_batch.model.take import Take
 
-_MM_PER_M = 1000.0
+MM_PER_M = 1000.0
 """Millimetres per metre."""
 
 _INVALID = -1.0
@@ -95,7 +95,7 @@ def write_c3d(path: Path, points: LabelledPoints, take: Take | None = None) -> P
     content.add_parameter("POINT", "Y_SCREEN", ["+Z"])
     frames, count = points.x_in_world_m.shape[:2]
     data = np.ones((4, count, frames))
-    data[:3] = _MM_PER_M * points.x_in_world_m.transpose(2, 1, 0)
+    data[:3] = MM_PER_M * points.x_in_world_m.transpose(2, 1, 0)
     content["data"]["points"] = data
     content["data"]["meta_points"]["residuals"] = _residuals(points)[None]
     facts = {} if take is None else take.figures()
@@ -121,7 +121,7 @@ def _residuals(points: LabelledPoints) -> FloatArray:
     out = np.zeros(points.x_in_world_m.shape[:2])
     if points.sigma_m is not None:
         known = np.isfinite(points.sigma_m)
-        out[known] = np.clip(np.round(_MM_PER_M * points.sigma_m[known]), *_RESIDUAL_RANGE_MM)
+        out[known] = np.clip(np.round(MM_PER_M * points.sigma_m[known]), *_RESIDUAL_RANGE_MM)
     if points.observed is not None:
         out[~points.observed] = 0.0
     out[:, ~points.measured_points()] = _INVALID
@@ -154,6 +154,6 @@ def read_c3d(path: Path) -> LabelledPoints:
     return LabelledPoints(
         names=tuple(group["LABELS"]["value"]),
         fps=float(group["RATE"]["value"][0]),
-        x_in_world_m=content["data"]["points"][:3].transpose(2, 1, 0) / _MM_PER_M,
+        x_in_world_m=content["data"]["points"][:3].transpose(2, 1, 0) / MM_PER_M,
         measured=~(residuals < 0.0).all(axis=1),
     )

@@ -11,26 +11,15 @@ from bodycap_batch.core.arrays import FloatArray, IntArray, set_array
 from bodycap_batch.core.errors import JobError
 from bodycap_batch.model.skeleton import Motion, SkeletonModel
 
-_SIDES = {"left": (1.0, 0.0, 0.0), "right": (-1.0, 0.0, 0.0)}
+_SIDES = {"Left": (1.0, 0.0, 0.0), "Right": (-1.0, 0.0, 0.0)}
 """Direction of each side in the T-pose: the left side is at +x."""
 
 ROLE_BY_TRUTH_NAME = {
-    "root": "Hips",
-    "torso": "Spine1",
-    "head": "Head",
-    **{
-        f"{side}_{joint}": side.title() + role
-        for side in _SIDES
-        for joint, role in {
-            "palm": "Hand",
-            "elbow": "ForeArm",
-            "shoulder": "Arm",
-            "hip": "UpLeg",
-            "knee": "Leg",
-            "ankle": "Foot",
-        }.items()
-    },
-}
+    "root": "Hips", "torso": "Spine1", "head": "Head", "left_palm": "LeftHand", "right_palm": "RightHand",
+    "left_elbow": "LeftForeArm", "right_elbow": "RightForeArm", "left_shoulder": "LeftArm",
+    "right_shoulder": "RightArm", "left_knee": "LeftLeg", "right_knee": "RightLeg", "left_hip": "LeftUpLeg",
+    "right_hip": "RightUpLeg", "left_ankle": "LeftFoot", "right_ankle": "RightFoot",
+}  # fmt: skip
 """Anatomical role of each joint in the ground truth file ``gt/joints.npz``, by the joint's name in this
 file."""
 
@@ -38,7 +27,7 @@ _ABOVE: dict[str, tuple[str, tuple[float, float, float]]] = {
     "Spine1": ("Hips", (0.0, 0.0, 1.0)),
     "Head": ("Spine1", (0.0, 0.0, 1.0)),
     **{
-        side.title() + role: (above if above in ("Hips", "Spine1") else side.title() + above, along or out)
+        side + role: (above if above in ("Hips", "Spine1") else side + above, along or out)
         for side, out in _SIDES.items()
         for role, above, along in (
             ("Arm", "Spine1", None),

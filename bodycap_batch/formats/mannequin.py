@@ -11,10 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.arrays import FloatArray, IntArray, interpolated
 from bodycap_batch.model.bone_axes import bone_ends_m, has_floor_root, main_children
 from bodycap_batch.model.skeleton import SkeletonModel, rest_pose
 from bodycap_batch.model.skeleton_presets import split_side
+
+COLOUR_RGB = (0.62, 0.66, 0.70)
+"""Colour of the mannequin, RGB, 0 to 1."""
 
 _MIN_BONE_STATURE = 0.004
 """Minimum length of a bone with a shape of its own, in statures. Evidence: none."""
@@ -281,10 +284,10 @@ def _trunk_part(trunk: Sequence[int], at: FloatArray, ends: FloatArray, stature:
     line[0] -= 0.4 * (line[1] - line[0])
     marks = np.cumsum([0.0, *np.linalg.norm(np.diff(line, axis=0), axis=1)])
     places = np.linspace(0.0, marks[-1], max(4, round(marks[-1] / (_TRUNK_RING_STATURE * stature))))
-    centres = np.stack([np.interp(places, marks, line[:, k]) for k in range(3)], axis=1)
+    centres = interpolated(places, marks, line)
     low, high = at[trunk[0]][2], max(line[-1][2], at[trunk[0]][2] + 0.28 * stature)
     fraction = (centres[:, 2] - low) / (high - low)
-    radii = stature * np.stack([np.interp(fraction, _TRUNK[:, 0], _TRUNK[:, k]) for k in (1, 2)], axis=1)
+    radii = stature * interpolated(fraction, _TRUNK[:, 0], _TRUNK[:, 1:])
     angle = np.linspace(np.pi / 2.0, 0.0, _CAP_RINGS + 1)[:-1]
     caps = []
     for end, sign in ((0, -1.0), (-1, 1.0)):

@@ -8,15 +8,12 @@ import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray, frozen_array
 from bodycap_batch.formats.atomic_files import write_text
-from bodycap_batch.formats.c3d import LabelledPoints
+from bodycap_batch.formats.c3d import MM_PER_M, LabelledPoints
 
 _FILE_FROM_WORLD: FloatArray = frozen_array(
     [[0, -1, 0], [0, 0, 1], [-1, 0, 0]], name="file_from_world", shape=(3, 3)
 )
 """Rotation from world axes (Z up, facing −Y, left +X) to file axes (X forward, Y up, Z to the right)."""
-
-_MM_PER_M = 1000.0
-"""Millimetres per metre."""
 
 
 def write_trc(path: Path, points: LabelledPoints) -> Path:
@@ -45,7 +42,7 @@ def write_trc(path: Path, points: LabelledPoints) -> Path:
         "",
     ]
     centres = points.x_in_world_m[:, measured]
-    table = (_MM_PER_M * centres @ _FILE_FROM_WORLD.T + 0.0).reshape(frames, 3 * count)
+    table = (MM_PER_M * centres @ _FILE_FROM_WORLD.T + 0.0).reshape(frames, 3 * count)
     row = "%d\t%.6f" + 3 * count * "\t%.3f"
     seconds = np.arange(frames) / points.fps
     lines += [row % (index + 1, seconds[index], *values) for index, values in enumerate(table)]

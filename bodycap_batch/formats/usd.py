@@ -12,7 +12,7 @@ from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.core.errors import JobError, StoreError
 from bodycap_batch.core.unique_names import unique_name
 from bodycap_batch.formats.atomic_files import atomic_replacement
-from bodycap_batch.formats.mannequin import Mannequin, make_mannequin
+from bodycap_batch.formats.mannequin import COLOUR_RGB, Mannequin, make_mannequin
 from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, rotation_from_quat_xyzw
 from bodycap_batch.model.measured_parts import joint_sources
 from bodycap_batch.model.skeleton import Motion, SkeletonModel, rest_pose
@@ -20,8 +20,6 @@ from bodycap_batch.model.take import Take
 
 _BODY_PATH, _SKELETON_PATH, _MESH_PATH = "/Body", "/Body/Skeleton", "/Body/Mannequin"
 _MOTION_PATH = "/Body/Skeleton/Motion"
-_BODY_COLOR_RGB = (0.62, 0.66, 0.70)
-"""Colour of the mannequin, RGB, 0 to 1."""
 
 _EXTENT_MARGIN_M = 0.3
 """Margin, metres, between the joint centres and the bounding box of the mannequin. Derivation: head, hands
@@ -201,7 +199,7 @@ def _define_mesh(stage: Any, body_mesh: Mannequin, skeleton: Any) -> None:
     mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(body_mesh.normals.astype(np.float32)))
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    mesh.CreateDisplayColorAttr([Gf.Vec3f(*_BODY_COLOR_RGB)])
+    mesh.CreateDisplayColorAttr([Gf.Vec3f(*COLOUR_RGB)])
     low, high = vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()
     mesh.CreateExtentAttr([Gf.Vec3f(*low), Gf.Vec3f(*high)])
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())

@@ -1,16 +1,8 @@
 """The use of inertial sensors with solved poses: alignment, gravity, and poses through lost frames."""
 
-from bodycap_batch.inertial.alignment import SensorAlignment, align_sensor
+from bodycap_batch.inertial.alignment import align_sensor
 from bodycap_batch.inertial.camera_rotation import camera_rotation
 from bodycap_batch.inertial.camera_sensor import use_sensor
 from bodycap_batch.inertial.force_windows import force_windows
-from bodycap_batch.inertial.samples import InertialSamples
 
-__all__ = [
-    "InertialSamples",
-    "SensorAlignment",
-    "align_sensor",
-    "camera_rotation",
-    "force_windows",
-    "use_sensor",
-]
+__all__ = ["align_sensor", "camera_rotation", "force_windows", "use_sensor"]

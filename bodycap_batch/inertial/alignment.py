@@ -12,7 +12,7 @@ from bodycap_batch.model.geometry import so3_log
 from bodycap_batch.model.gyro_rates import GyroOrientation
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.telemetry.comparison import PictureGyroComparison, judge_rotations
-from bodycap_batch.telemetry.gyro_fit import GyroFit
+from bodycap_batch.telemetry.gyro_fit import GyroFit, RateIntegral
 from bodycap_batch.telemetry.picture_rotation import PictureRotation
 from bodycap_batch.telemetry.streams import CameraTelemetry
 
@@ -107,15 +107,6 @@ def _axis_change(pairs: PictureRotation, samples: InertialSamples) -> FloatArray
     oriented = GyroOrientation(samples.times_s, samples.rate_rad_s)
     first, second = oriented.at(pairs.start_s), oriented.at(pairs.end_s)
     exact = so3_log(np.swapaxes(first, 1, 2) @ second)
-    steps = 0.5 * (samples.rate_rad_s[1:] + samples.rate_rad_s[:-1]) * np.diff(samples.times_s)[:, None]
-    total = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    plain = np.stack(
-        [
-            np.interp(pairs.end_s, samples.times_s, total[:, axis])
-            - np.interp(pairs.start_s, samples.times_s, total[:, axis])
-            for axis in range(3)
-        ],
-        axis=1,
-    )
+    plain = RateIntegral(samples.times_s, samples.rate_rad_s).between(pairs.start_s, pairs.end_s)
     outside = ~samples.covers(pairs.start_s, pairs.end_s)
     return np.where(outside[:, None], 0.0, exact - plain)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from bodycap_batch.config.options import TelemetryOptions
-from bodycap_batch.core.arrays import BoolArray
 from bodycap_batch.inertial.alignment import SensorAlignment, align_sensor
 from bodycap_batch.inertial.clip_solver import ClipSolver
 from bodycap_batch.inertial.force_windows import force_windows
@@ -16,11 +15,10 @@ from bodycap_batch.inertial.gap_filling import constants_of_clip, fill_gaps
 from bodycap_batch.inertial.path_solving import solve_path
 from bodycap_batch.model.earth import GpsFixes
 from bodycap_batch.model.gravity import fit_gravity
-from bodycap_batch.model.inertial_camera import ForceWindows, InertialCamera, SensorRelation
+from bodycap_batch.model.inertial_camera import ForceWindows, InertialCamera
 from bodycap_batch.model.picture_turns import PictureTurns
 from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.telemetry.comparison import PictureGyroComparison
-from bodycap_batch.telemetry.gyro_fit import GyroFit
 from bodycap_batch.telemetry.picture_orientation import turns_of_pictures, unrecorded_turns
 from bodycap_batch.telemetry.streams import CameraTelemetry, GpsTrack
 
@@ -126,7 +124,7 @@ def use_sensor(
     """
     own = _Prepared.of(pictures, telemetry)
     trajectory, aligned, windows = own.trajectory, own.aligned, own.windows
-    used = _UsedPath(trajectory)
+    used, frames = trajectory, dict[str, int]()
     if windows is not None and (options.gaps or options.smoothing):
         prepared = [_Prepared.of(*other) for other in others if other[0].gauge == trajectory.gauge]
         solver = own.solver(prepared)
@@ -136,42 +134,32 @@ def use_sensor(
                 for index, other in enumerate(prepared)
                 if (found := other.solver([own, *prepared[:index], *prepared[index + 1 :]])) is not None
             ]
-            used = _used_path(solver, around, options)
+            used, frames = _used_path(solver, around, options)
     camera = InertialCamera(
         camera=trajectory.camera,
         gauge=trajectory.gauge,
         source=telemetry.source,
         verdict=aligned.comparison.verdict,
         reason=aligned.comparison.reason,
-        relation=None if aligned.fit is None else _relation(aligned.fit),
+        relation=aligned.fit,
         windows=windows if options.gravity and windows is not None and len(windows.times_s) else None,
-        filled=used.filled,
-        refused=used.refused,
-        solved=used.solved,
-        replaced=used.replaced,
         gps=_gps_fixes(telemetry.gps) if options.gps and telemetry.gps is not None else None,
         turns=own.turns,
+        **frames,
     )
-    if used.trajectory is trajectory:
+    if used is trajectory:
         return UsedSensor(camera=camera, trajectory=pictures)
     exact = None if own.turns is None else own.turns.exact()
-    solved = used.trajectory if exact is None else exact.picture_path(used.trajectory)
+    solved = used if exact is None else exact.picture_path(used)
     return UsedSensor(camera=camera, trajectory=solved)
 
 
-@dataclass(frozen=True, slots=True)
-class _UsedPath:
-    """A trajectory after the sensor was used, and the number of frames as in `InertialCamera`."""
+def _used_path(
+    solver: ClipSolver, others: Sequence[ClipSolver], options: TelemetryOptions
+) -> tuple[Trajectory, dict[str, int]]:
+    """Return the trajectory with the poses that the sensor improved and added, and the numbers of frames.
 
-    trajectory: Trajectory
-    filled: int = 0
-    refused: int = 0
-    solved: int = 0
-    replaced: int = 0
-
-
-def _used_path(solver: ClipSolver, others: Sequence[ClipSolver], options: TelemetryOptions) -> _UsedPath:
-    """Return the trajectory with the poses that the sensor improved and added.
+    The names of the numbers are those of `InertialCamera`.
 
     A pose that contradicts the sensor is replaced like that of a lost frame. If that is not possible, it
     stays.
@@ -183,35 +171,15 @@ def _used_path(solver: ClipSolver, others: Sequence[ClipSolver], options: Teleme
         solved = solve_path(solver)
         moved, wrong, result = solved.moved, solved.wrong, solved.trajectory
     if not options.gaps:
-        return _UsedPath(result, solved=int(moved.sum()))
+        return result, {"solved": int(moved.sum())}
     found = fill_gaps(solver.without(wrong), others)
-    inertial = found.trajectory.localised & ~found.trajectory.registered
-    refused = found.refused - int((wrong & ~inertial).sum())
-    return _UsedPath(
-        _with_frames(result, found.trajectory, inertial),
-        filled=int((inertial & ~wrong).sum()),
-        refused=max(refused, 0),
-        solved=int(moved.sum()),
-        replaced=int((inertial & wrong).sum()),
-    )
-
-
-def _with_frames(path: Trajectory, source: Trajectory, chosen: BoolArray) -> Trajectory:
-    """Return a trajectory in which the chosen frames (N,) are those of another one."""
-    if not chosen.any():
-        return path
-    status = [
-        new if is_chosen else old
-        for old, new, is_chosen in zip(path.status, source.status, chosen.tolist(), strict=True)
-    ]
-    return replace(
-        path,
-        gauge_from_cam=np.where(chosen[:, None, None], source.gauge_from_cam, path.gauge_from_cam),
-        covariance=np.where(chosen[:, None, None], source.covariance, path.covariance),
-        status=tuple(status),
-        inliers=np.where(chosen, source.inliers, path.inliers),
-        error_px=np.where(chosen, source.error_px, path.error_px),
-    )
+    refused = found.refused - int((wrong & ~found.filled).sum())
+    return found.added_to(result), {
+        "filled": int((found.filled & ~wrong).sum()),
+        "refused": max(refused, 0),
+        "solved": int(moved.sum()),
+        "replaced": int((found.filled & wrong).sum()),
+    }
 
 
 def _gps_fixes(track: GpsTrack) -> GpsFixes | None:
@@ -226,19 +194,4 @@ def _gps_fixes(track: GpsTrack) -> GpsFixes | None:
         latitude_longitude_deg=track.latitude_longitude_deg[usable],
         altitude_m=track.altitude_m[usable],
         sigma_m=np.maximum(sigma_m[usable], _SIGMA_PER_DILUTION_M),
-    )
-
-
-def _relation(fit: GyroFit) -> SensorRelation:
-    return SensorRelation(
-        delay_s=fit.delay_s,
-        delay_sigma_s=fit.delay_sigma_s,
-        drift=fit.drift,
-        drift_sigma=fit.drift_sigma,
-        cam_from_sensor=fit.cam_from_sensor,
-        rotation_sigma_rad=np.asarray(fit.rotation_sigma_rad),
-        bias_rad_s=fit.bias_rad_s,
-        bias_sigma_rad_s=np.asarray(fit.bias_sigma_rad_s),
-        r_squared=fit.r_squared,
-        pairs=fit.pairs,
     )

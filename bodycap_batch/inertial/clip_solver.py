@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.core.arrays import BoolArray
 from bodycap_batch.inertial.gap_solver import LOG_SCALE, Constants, SolvedStretch, Stretch, solve_stretch
 from bodycap_batch.inertial.preintegration import SensorNoise
 from bodycap_batch.inertial.samples import InertialSamples
@@ -41,6 +41,7 @@ class ClipSolver:
         times_s: (N,) times of the frames.
         known: (N,) True for localised frames whose time is later than that of the frame before.
         metres_per_unit: Scale of the gauge.
+        covariance: (N,6,6) covariances of the poses, with the error of each single pose.
     """
 
     def __init__(self, trajectory: Trajectory, samples: InertialSamples, constants: Constants) -> None:
@@ -58,7 +59,7 @@ class ClipSolver:
         self.known = trajectory.localised & np.asarray(np.diff(self.times_s, prepend=-np.inf) > 0.0)
         self.metres_per_unit = float(np.exp(constants.mean[LOG_SCALE][0]))
         floor = np.repeat([_MIN_SIGMA_RAD**2, (_MIN_SIGMA_M / self.metres_per_unit) ** 2], 3)
-        self._covariance = trajectory.covariance + np.diag(floor)
+        self.covariance = trajectory.covariance + np.diag(floor)
 
     def without(self, left_out: BoolArray) -> ClipSolver:
         """Return a solver in which some frames (N,) count as lost."""
@@ -82,7 +83,7 @@ class ClipSolver:
                 Stretch(
                     times_s=self.times_s[stretch],
                     gauge_from_cam=self.trajectory.gauge_from_cam[stretch],
-                    covariance=growth * self._covariance[stretch],
+                    covariance=growth * self.covariance[stretch],
                     known=known[stretch],
                 ),
                 self.samples,
@@ -115,7 +116,3 @@ class ClipSolver:
             growth *= ratio**2
             solved = self.solve(start, end, known, growth)
         return None if solved is None else (solved, growth)
-
-    def pose_covariance(self, frames: slice) -> FloatArray:
-        """Return the covariances (F,6,6) of localised poses, with the error of each single pose."""
-        return self._covariance[frames]

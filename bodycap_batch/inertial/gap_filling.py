@@ -67,18 +67,38 @@ that is more. Evidence: none."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilledGaps:
-    """A trajectory whose short gaps were filled.
+    """The poses of lost frames in short gaps.
 
     Attributes:
-        trajectory: The trajectory; filled frames have the status `FrameStatus.INERTIAL`.
-        filled: Number of filled frames.
+        filled: (N,) True for the frames that got a pose.
+        gauge_from_cam: (N,4,4) their poses; any values elsewhere.
+        covariance: (N,6,6) the covariances of these poses.
         refused: Number of frames in short gaps that were not filled, because their poses were too uncertain
             or contradicted the poses beside them.
     """
 
-    trajectory: Trajectory
-    filled: int
+    filled: BoolArray
+    gauge_from_cam: FloatArray
+    covariance: FloatArray
     refused: int
+
+    def added_to(self, path: Trajectory) -> Trajectory:
+        """Return a trajectory with the filled frames, which have the status `FrameStatus.INERTIAL`."""
+        filled = self.filled
+        if not filled.any():
+            return path
+        status = [
+            FrameStatus.INERTIAL if is_filled else old
+            for old, is_filled in zip(path.status, filled.tolist(), strict=True)
+        ]
+        return replace(
+            path,
+            gauge_from_cam=np.where(filled[:, None, None], self.gauge_from_cam, path.gauge_from_cam),
+            covariance=np.where(filled[:, None, None], self.covariance, path.covariance),
+            status=tuple(status),
+            inliers=np.where(filled, 0, path.inliers),
+            error_px=np.where(filled, np.nan, path.error_px),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,35 +147,17 @@ def fill_gaps(solver: ClipSolver, others: Sequence[ClipSolver] = ()) -> FilledGa
         others: The same of other cameras of the map. Their held-out stretches give the sigmas if those of
             this camera do not.
     """
-    trajectory = solver.trajectory
     filler = _Filler(solver, [_Filler(other) for other in others])
-    poses, covariance = trajectory.gauge_from_cam.copy(), trajectory.covariance.copy()
-    status = list(trajectory.status)
-    filled = refused = 0
+    poses, covariance = solver.trajectory.gauge_from_cam.copy(), solver.trajectory.covariance.copy()
+    filled, refused = np.zeros(len(poses), dtype=bool), 0
     for gap in filler.gaps():
-        found = filler.fill(gap)
+        lost, found = slice(gap.first, gap.last), filler.fill(gap)
         if found is None:
             refused += gap.last - gap.first
-            continue
-        lost = slice(gap.first, gap.last)
-        poses[lost], covariance[lost] = found
-        status[lost] = [FrameStatus.INERTIAL] * (gap.last - gap.first)
-        filled += gap.last - gap.first
-    if not filled:
-        return FilledGaps(trajectory=trajectory, filled=0, refused=refused)
-    is_filled = np.array([each is FrameStatus.INERTIAL for each in status], dtype=bool)
-    return FilledGaps(
-        trajectory=replace(
-            trajectory,
-            gauge_from_cam=poses,
-            covariance=covariance,
-            status=tuple(status),
-            inliers=np.where(is_filled, 0, trajectory.inliers),
-            error_px=np.where(is_filled, np.nan, trajectory.error_px),
-        ),
-        filled=filled,
-        refused=refused,
-    )
+        else:
+            poses[lost], covariance[lost] = found
+            filled[lost] = True
+    return FilledGaps(filled=filled, gauge_from_cam=poses, covariance=covariance, refused=refused)
 
 
 class _Filler:
@@ -165,7 +167,6 @@ class _Filler:
         self._solver, self._others = solver, others
         self._times_s, self._known = solver.times_s, solver.known
         self._unit = np.repeat([1.0, solver.metres_per_unit], 3)
-        self._factors: dict[float, tuple[float, float] | None] = {}
         self._errors: dict[float, list[FloatArray]] = {}
 
     def gaps(self) -> Iterator[_Gap]:
@@ -248,10 +249,8 @@ class _Filler:
         None if there are too few stretches to hold out, or if the sensor does not describe the motion.
         """
         length_s = next((each for each in _LENGTHS_S if each >= length_s - _ROUNDING_S), _LENGTHS_S[-1])
-        if length_s not in self._factors:
-            own = self._own_factors(length_s)
-            self._factors[length_s] = self._factors_with_others(length_s) if own is None else own
-        return self._factors[length_s]
+        own = self._own_factors(length_s)
+        return self._factors_with_others(length_s) if own is None else own
 
     def _own_factors(self, length_s: float) -> tuple[float, float] | None:
         """Return the factors that the stretches of this camera give."""
@@ -290,7 +289,7 @@ class _Filler:
             inner = slice(gap.first - gap.start, gap.last - gap.start)
             held_out = slice(gap.first, gap.last)
             # The errors of the held-out poses are as much larger than stated as those beside them.
-            excess = (growth - 1.0) * self._solver.pose_covariance(held_out)
+            excess = (growth - 1.0) * self._solver.covariance[held_out]
             errors.append(
                 self._normalised_errors(
                     self._solver.trajectory.gauge_from_cam[held_out],

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, interpolated, set_array
 from bodycap_batch.inertial.preintegration import (
     Preintegrated,
     SensorNoise,
@@ -159,10 +159,7 @@ class _Problem:
         self._steps: Steps = steps_between(samples, stretch.times_s)
         measured = samples.covers(stretch.times_s[:-1], stretch.times_s[1:])
         self._trust = np.where(measured, 1.0, _WITHOUT_SAMPLES)
-        self._rate = np.stack(
-            [np.interp(stretch.times_s, samples.times_s, samples.rate_rad_s[:, axis]) for axis in range(3)],
-            axis=1,
-        )
+        self._rate = interpolated(stretch.times_s, samples.times_s, samples.rate_rad_s)
         self._nodes = len(stretch.times_s)
 
     def initial(self) -> _State:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.core.arrays import FloatArray, IntArray
+from bodycap_batch.core.arrays import FloatArray, IntArray, interpolated
 from bodycap_batch.inertial.samples import InertialSamples
 from bodycap_batch.model.geometry import skew, so3_exp
 
@@ -82,8 +82,7 @@ def steps_between(samples: InertialSamples, nodes_s: FloatArray) -> Steps:
     inside = samples.times_s[(samples.times_s > nodes_s[0]) & (samples.times_s < nodes_s[-1])]
     knots_s = np.unique(np.concatenate([nodes_s, inside]))
     rate, force = (
-        np.stack([np.interp(knots_s, samples.times_s, values[:, axis]) for axis in range(3)], axis=1)
-        for values in (samples.rate_rad_s, samples.force_m_s2)
+        interpolated(knots_s, samples.times_s, values) for values in (samples.rate_rad_s, samples.force_m_s2)
     )
     owner: IntArray = np.searchsorted(nodes_s, knots_s[:-1], side="right") - 1
     place = np.arange(len(owner)) - np.searchsorted(owner, owner)

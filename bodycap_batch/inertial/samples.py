@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, set_array
+from bodycap_batch.core.arrays import BoolArray, FloatArray, interpolated, set_array
 from bodycap_batch.model.geometry import so3_exp, so3_log
 from bodycap_batch.model.gyro_rates import GyroOrientation
 from bodycap_batch.telemetry.gyro_fit import GyroFit
@@ -52,19 +52,16 @@ def samples_of_fit(gyro: Stream, accelerometer: Stream | None, fit: GyroFit) -> 
         accelerometer: The accelerometer; None if there is none.
         fit: The relation of the gyroscope to the camera.
     """
-    delay_s = fit.delay_s + fit.drift * (gyro.times_s - fit.middle_s)
+    times_s, rate_rad_s = fit.in_camera(gyro)
     gaps_s = gyro.gaps_s
     force = np.full(gyro.values.shape, np.nan)
     if accelerometer is not None and len(accelerometer.times_s) > 1:
         gaps_s += accelerometer.gaps_s
         inside = (gyro.times_s >= accelerometer.times_s[0]) & (gyro.times_s <= accelerometer.times_s[-1])
-        for axis in range(3):
-            force[inside, axis] = np.interp(
-                gyro.times_s[inside], accelerometer.times_s, accelerometer.values[:, axis]
-            )
+        force[inside] = interpolated(gyro.times_s[inside], accelerometer.times_s, accelerometer.values)
     return InertialSamples(
-        times_s=gyro.times_s - delay_s,
-        rate_rad_s=(gyro.values - fit.bias_rad_s) @ fit.cam_from_sensor.T,
+        times_s=times_s,
+        rate_rad_s=rate_rad_s,
         force_m_s2=force @ fit.cam_from_sensor.T,
         gaps_s=tuple((start_s - fit.delay_s, end_s - fit.delay_s) for start_s, end_s in gaps_s),
     )

@@ -17,6 +17,8 @@ from bodycap_batch.model.inertial_camera import ForceWindows
 
 GRAVITY_M_S2 = 9.81
 """Magnitude of gravity, m/s². It varies by 0.3 % on Earth."""
+STANDARD_GRAVITY_M_S2 = 9.80665
+"""Standard acceleration of gravity, m/s²: the unit g of accelerometers."""
 _GRAVITY_SIGMA_M_S2 = 0.1
 """Standard deviation (m/s²) of the measured magnitude of gravity: the place on Earth, and the scale error of
 consumer's accelerometers, 1 %."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, set_array
+from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray, interpolated, set_array
 from bodycap_batch.model.geometry import so3_exp, so3_log
 
 _RATE_SAMPLES = 2.0
@@ -115,16 +115,14 @@ class GyroRates:
         steps = 0.5 * (self.rate_rad_s[1:] + self.rate_rad_s[:-1]) * np.diff(self.times_s)[:, None]
         total = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
         plain = self._integral(total, start_s + delay_s) - self._integral(total, start_s)
-        early, late = (self._rate(start_s + share * delay_s) for share in _GAUSS_POINTS)
+        early, late = (
+            interpolated(start_s + share * delay_s, self.times_s, self.rate_rad_s) for share in _GAUSS_POINTS
+        )
         return np.asarray(plain + _AXIS_CHANGE * (delay_s**2)[:, None] * np.cross(early, late))
-
-    def _rate(self, times_s: FloatArray) -> FloatArray:
-        columns = [np.interp(times_s, self.times_s, column) for column in self.rate_rad_s.T]
-        return np.stack(columns, axis=1)
 
     def _integral(self, total: FloatArray, times_s: FloatArray) -> FloatArray:
         """Return integrals (M,3) of the rate from the first sample; (S,3) `total` holds those of samples."""
         before = np.clip(np.searchsorted(self.times_s, times_s, side="right") - 1, 0, len(self.times_s) - 2)
         step_s = (times_s - self.times_s[before])[:, None]
-        mean = 0.5 * (self.rate_rad_s[before] + self._rate(times_s))
+        mean = 0.5 * (self.rate_rad_s[before] + interpolated(times_s, self.times_s, self.rate_rad_s))
         return np.asarray(total[before] + mean * step_s)

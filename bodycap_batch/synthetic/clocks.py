@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.config.mounts import REFERENCE_ROLES, mount_of
+from bodycap_batch.config.mounts import mount_of, reference_index
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.synthetic.options import SynthOptions
 
@@ -61,12 +61,8 @@ def true_clocks(options: SynthOptions) -> dict[str, TrueClock]:
 
 def reference_name(cameras: tuple[str, ...]) -> str:
     """Return the name of the camera whose clock is the common clock: on the torso, else the first camera."""
-    for role in REFERENCE_ROLES:
-        for name in cameras:
-            place = mount_of(name)
-            if place is not None and place[1] == role:
-                return name
-    return cameras[0]
+    places = [mount_of(name) for name in cameras]
+    return cameras[reference_index([None if place is None else place[1] for place in places])]
 
 
 def has_own_clocks(options: SynthOptions) -> bool:

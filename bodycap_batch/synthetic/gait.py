@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.skeleton import SkeletonModel, forward_kinematics
+from bodycap_batch.synthetic.foot_roll import shape_of
 from bodycap_batch.synthetic.gait_plan import MARGIN_S, smooth_step
 from bodycap_batch.synthetic.pressing import ArmAngles, Press, rotation_about
 
@@ -39,9 +40,12 @@ _LAP = np.array(
 """Positions on one lap. Columns: time (seconds); x and y (metres from the room's middle); direction of the
 face (degrees from +x, counter-clockwise). The lap starts with steps to the right while the person faces a
 wall, because a map is easy to initialise from sideways movement."""
-_TURN_S, _TURN_DEG, _SWAY_M = 5.0, 75.0, 0.02
-"""Motion of a person who rotates on the spot: period (s), maximum rotation to each side (degrees), amplitude
-of the sway (m)."""
+_TURN_WAVES, _STILL_WAVES = (
+    ((0.02, 1.1, 1.0), (0.02, 0.9, 1.0), (75.0, 2 * np.pi, 5.0)),
+    ((0.003, 1.3, 1.0), (0.003, 0.9, 1.0), (0.4, 0.7, 1.0)),
+)
+"""Motion of a person who rotates on the spot, and of one who stands still, along x, y (m) and about the
+vertical (degrees): amplitude, phase (radians) in a period, and period (s)."""
 _STILL_NOD_DEG = 22.0
 """Nod (degrees) of a person who looks at a table. Neck and head each turn by 0.6 of it."""
 _STILL_PARTS, _STILL_SHARE, _STILL_ARMS_AHEAD = ("Bend", "Lean", "Turn", "Look", "Nod"), 0.12, 0.7
@@ -49,6 +53,8 @@ _STILL_PARTS, _STILL_SHARE, _STILL_ARMS_AHEAD = ("Bend", "Lean", "Turn", "Look",
 are ahead. Evidence: none."""
 _ARM_PARTS = ("Lift", "Ahead", "Arm", "Out", "Spin", "Elbow", "Twist")
 """Names of the angles of an arm's posture, which `WalkStyle.posture` explains."""
+_WAVING_PARTS = ("Arm", "Out", "Elbow", "Twist", "Wrist", "Radial")
+"""Names of the angles of an arm that oscillate slowly."""
 _SAMPLE_HZ = 50.0
 """Sampling rate (Hz) of the two splines that describe the gait phase and the height of the root."""
 
@@ -75,20 +81,14 @@ class _ArmReach:
         start_s: Common time at which the movement starts, seconds.
         ramp_s: Duration of reaching out, and of returning, seconds.
         hold_s: Time for which the arm stays stretched out, seconds.
-        flexion: Additional flexion of the shoulder, degrees.
-        abduction: Additional abduction of the shoulder, degrees.
-        elbow: Additional flexion of the elbow, degrees.
-        pronation: Additional pronation of the forearm, degrees.
+        degrees: Additional angles, degrees, by field of `ArmAngles`.
     """
 
     side: str
     start_s: float
     ramp_s: float
     hold_s: float
-    flexion: float
-    abduction: float
-    elbow: float
-    pronation: float
+    degrees: Mapping[str, float]
 
     def weight(self, t_s: FloatArray) -> FloatArray:
         """Return the weight (T,) of the additional angles at common times (T,). It is smooth, 0 to 1."""
@@ -128,6 +128,19 @@ class WalkStyle:
     still: bool = False
     posture: Mapping[str, float] = field(default_factory=dict)
 
+    def held(self, side: str) -> dict[str, float]:
+        """Return the angles of the posture of one arm (``Left`` or ``Right``), degrees, by name."""
+        return {part: self.posture.get(side + part, 0.0) for part in _ARM_PARTS}
+
+    def pressed(
+        self, side: str, angles: ArmAngles, lift_deg: FloatArray, t_s: FloatArray
+    ) -> tuple[ArmAngles, FloatArray]:
+        """Return angles and rise (T,) of the shoulder girdle of one arm with the presses, at times (T,)."""
+        for press in self.presses:
+            if press.side == side:
+                angles, lift_deg = press.blended(angles, t_s), lift_deg * (1.0 - press.weight(t_s))
+        return angles, lift_deg
+
 
 class Walk:
     """The built-in walk: the pose of the body at any time.
@@ -147,12 +160,14 @@ class Walk:
         self._t_pose_s = style.t_pose_s
         self._arms_ahead = max(style.arms_ahead, _STILL_ARMS_AHEAD if style.still else 0.0)
         self._nod_deg = _STILL_NOD_DEG if style.still else 3.0
-        self._presses = style.presses
-        self._posture = style.posture
+        self._style = style
         # Use separate random streams, so that a longer capture starts with the walk of a shorter capture.
         for_path, for_reaches, rng = rng.spawn(3)
-        draw = _draw_stillness if style.still else _draw_turns if style.on_the_spot else _draw_path
-        self._route = draw(length_s, for_path)
+        if style.still or style.on_the_spot:
+            waves = _STILL_WAVES if style.still else _TURN_WAVES
+            self._route = _draw_standing(length_s, waves, for_path)
+        else:
+            self._route = _draw_path(length_s, for_path)
         self._stride_gain = float(rng.uniform(0.92, 1.08))
         self._oscillations = {
             name: _draw_oscillation(
@@ -193,21 +208,15 @@ class Walk:
     def _standing_height(self, t_s: FloatArray) -> FloatArray:
         """Return the height (T,) of the root in metres at which the lower foot touches the floor."""
         poses = forward_kinematics(self.skeleton, np.zeros((len(t_s), 3)), self._rotations(t_s))
-        soles = []
+        soles, flat = [], np.array([0.0, 0.0, -shape_of(self.skeleton, "Left").height_m])
         for joint, name in enumerate(self.skeleton.joints):
             if name.endswith(("Foot", "ToeBase")):
                 end = self.skeleton.end_offsets_m[joint]
-                sole = np.nan_to_num(end) if np.isfinite(end).all() else np.array([0.0, 0.0, -self._ankle_m])
+                sole = end if np.isfinite(end).all() else flat
                 soles.append((poses[:, joint, :3, :3] @ sole + poses[:, joint, :3, 3])[:, 2])
         softness_m = 0.01  # smoothness of the minimum over the soles
         lowest = -softness_m * np.log(np.exp(-np.array(soles) / softness_m).sum(axis=0))
         return np.asarray(-lowest)
-
-    @property
-    def _ankle_m(self) -> float:
-        """Height of the ankle above the sole, metres."""
-        toe = self.skeleton.joints.index("LeftToeBase")
-        return float(-self.skeleton.offsets_m[toe, 2] - self.skeleton.end_offsets_m[toe, 2])
 
     def _rotations(self, t_s: FloatArray) -> FloatArray:
         """Return the rotations parent_from_joint (T,J,3,3) at common times (T,) in seconds."""
@@ -228,7 +237,7 @@ class Walk:
         ]
         out = {"Hips": rotation_about("Z", pelvis_yaw) * rotation_about("XY", np.column_stack(pelvis_tilt))}
         twist = walk_weight * (wave["Turn"](t_s) - 3.0 * stride * np.cos(phase))
-        bend, turn = (self._posture.get(part, 0.0) for part in ("Bend", "Turn"))
+        bend, turn = (self._style.posture.get(part, 0.0) for part in ("Bend", "Turn"))
         for share, name in ((0.45, "Spine"), (0.55, "Spine1")):
             angles = [
                 share * twist + share * turn,
@@ -241,8 +250,7 @@ class Walk:
         for side, leg_phase in (("Left", phase + np.pi), ("Right", phase)):
             self._leg(side, leg_phase, (stride * walk_weight, sidestep * walk_weight), out)
             self._arm(side, t_s, (stride * np.cos(leg_phase + np.pi), walk_weight), out)
-        identity = Rotation.identity(len(t_s))
-        return np.stack([out.get(name, identity).as_matrix() for name in self.skeleton.joints], axis=1)
+        return local_rotations(self.skeleton, out, len(t_s))
 
     def _t_pose(self, t_s: FloatArray) -> FloatArray:
         """Return the weight (T,) of the T-pose.
@@ -284,37 +292,36 @@ class Walk:
         The arm swings opposite to the leg. Slow oscillations, reaching and presses are added.
         """
         forth, walk_weight = swing
-        wave, outward = self._oscillations, 1.0 if side == "Left" else -1.0
-        held = {part: self._posture.get(side + part, 0.0) for part in _ARM_PARTS}
-        flexion = 4.0 + held["Arm"] + 11.0 * forth + wave[f"{side}Arm"](t_s)
-        abduction = 10.0 + held["Out"] + wave[f"{side}Out"](t_s)
-        elbow = 24.0 + held["Elbow"] + 7.0 * forth + wave[f"{side}Elbow"](t_s)
-        pronation = 8.0 + held["Twist"] + wave[f"{side}Twist"](t_s)
-        flexion, elbow = flexion + 25.0 * self._arms_ahead, elbow + 60.0 * self._arms_ahead
+        held, ahead = self._style.held(side), self._arms_ahead
+        wave = {part: self._oscillations[side + part](t_s) for part in _WAVING_PARTS}
+        degrees: dict[str, FloatArray] = {
+            "flexion": 4.0 + held["Arm"] + 11.0 * forth + wave["Arm"] + 25.0 * ahead,
+            "abduction": 10.0 + held["Out"] + wave["Out"],
+            "elbow": 24.0 + held["Elbow"] + 7.0 * forth + wave["Elbow"] + 60.0 * ahead,
+            "pronation": 8.0 + held["Twist"] + wave["Twist"],
+            "spin": np.full_like(t_s, held["Spin"]),
+            "wrist": wave["Wrist"],
+            "radial": wave["Radial"],
+        }
         lift = np.zeros_like(t_s)
         for reach in self._reaches:
             if reach.side == side:
                 weight = reach.weight(t_s)
-                flexion, abduction = flexion + weight * reach.flexion, abduction + weight * reach.abduction
-                elbow, pronation = elbow + weight * reach.elbow, pronation + weight * reach.pronation
+                for name, extra in reach.degrees.items():
+                    degrees[name] = degrees[name] + weight * extra
                 lift = lift + weight * 5.0
-        angles = ArmAngles(
-            flexion=flexion,
-            abduction=abduction,
-            elbow=elbow,
-            pronation=pronation,
-            spin=np.full_like(t_s, held["Spin"]),
-            wrist=wave[f"{side}Wrist"](t_s),
-            radial=wave[f"{side}Radial"](t_s),
-        )
-        for press in self._presses:
-            if press.side == side:
-                angles, lift = press.blended(angles, t_s), lift * (1.0 - press.weight(t_s))
+        angles, lift = self._style.pressed(side, ArmAngles(**degrees), lift, t_s)
+        outward = 1.0 if side == "Left" else -1.0
         shoulder = rotation_about("Y", -outward * (walk_weight * lift + held["Lift"]))
         if held["Ahead"]:
             shoulder = rotation_about("Z", np.full_like(t_s, -outward * held["Ahead"])) * shoulder
-        out[f"{side}Shoulder"] = shoulder
-        out.update(angles.rotations(side, walk_weight))
+        out.update({f"{side}Shoulder": shoulder, **angles.rotations(side, walk_weight)})
+
+
+def local_rotations(skeleton: SkeletonModel, turns: Mapping[str, Rotation], count: int) -> FloatArray:
+    """Return the rotations parent_from_joint (T,J,3,3) at `count` times; without one, the identity."""
+    identity = Rotation.identity(count)
+    return np.stack([turns.get(name, identity).as_matrix() for name in skeleton.joints], axis=1)
 
 
 def _draw_path(length_s: float, rng: np.random.Generator) -> CubicSpline:
@@ -329,21 +336,15 @@ def _draw_path(length_s: float, rng: np.random.Generator) -> CubicSpline:
     return CubicSpline(knots[:, 0], knots[:, 1:])
 
 
-def _draw_turns(length_s: float, rng: np.random.Generator) -> CubicSpline:
-    """Return x, y (m) and heading (degrees) over time for a person who rotates on the spot."""
+def _draw_standing(
+    length_s: float, waves: tuple[tuple[float, float, float], ...], rng: np.random.Generator
+) -> CubicSpline:
+    """Return x, y (m) and heading (degrees) over time for a person who stays in one place and faces +y."""
     times = np.arange(-2.0 * MARGIN_S, length_s + 2.0 * MARGIN_S, 0.1)
-    phase = rng.uniform(0, 2 * np.pi, 3)
-    x, y = (_SWAY_M * np.sin(rate * times + phase[axis]) for axis, rate in enumerate((1.1, 0.9)))
-    heading = 90.0 + _TURN_DEG * np.sin(2 * np.pi * times / _TURN_S + phase[2])
-    return CubicSpline(times, np.column_stack([x, y, heading]))
-
-
-def _draw_stillness(length_s: float, rng: np.random.Generator) -> CubicSpline:
-    """Return x, y (m) and heading (degrees) over time for a person who stands still and faces +y."""
-    times = np.arange(-2.0 * MARGIN_S, length_s + 2.0 * MARGIN_S, 0.1)
-    phase = rng.uniform(0, 2 * np.pi, 3)
-    waves = [np.sin(rate * times + start) for rate, start in zip((1.3, 0.9, 0.7), phase, strict=True)]
-    x, y, heading = (size * wave for size, wave in zip((0.003, 0.003, 0.4), waves, strict=True))
+    x, y, heading = (
+        size * np.sin(rate * times / period_s + phase)
+        for (size, rate, period_s), phase in zip(waves, rng.uniform(0, 2 * np.pi, 3), strict=True)
+    )
     return CubicSpline(times, np.column_stack([x, y, 90.0 + heading]))
 
 
@@ -363,10 +364,12 @@ def _draw_reaches(length_s: float, t_pose_s: float, rng: np.random.Generator) ->
                 start_s=start,
                 ramp_s=float(rng.uniform(1.0, 1.3)),
                 hold_s=float(rng.uniform(0.3, 0.8)),
-                flexion=float(rng.uniform(8, 18) if to_side else rng.uniform(28, 42)),
-                abduction=float(rng.uniform(30, 42) if to_side else rng.uniform(4, 12)),
-                elbow=float(rng.uniform(-14, -6)),
-                pronation=float(rng.uniform(10, 25)),
+                degrees={
+                    "flexion": float(rng.uniform(*((8, 18) if to_side else (28, 42)))),
+                    "abduction": float(rng.uniform(*((30, 42) if to_side else (4, 12)))),
+                    "elbow": float(rng.uniform(-14, -6)),
+                    "pronation": float(rng.uniform(10, 25)),
+                },
             )
         )
         start += float(rng.uniform(1.8, 3.2))

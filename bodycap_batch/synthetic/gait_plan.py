@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -110,33 +112,6 @@ class Bout:
     speed_m_s: float
 
 
-@dataclass(slots=True, kw_only=True)
-class Footprints:
-    """The stances of one foot. The first stance starts before the plan, the last one ends after it.
-
-    Attributes:
-        strike_s: Times at which the foot touches the floor, seconds.
-        off_s: Times at which the foot leaves the floor, seconds.
-        place_m: Places of the ankle above the floor, metres.
-        yaw_deg: Directions of the foot, degrees; 0: towards −y. They do not jump by 360 degrees.
-        strike_deg: Angles of the foot at the first contact, degrees; negative: the toes are up.
-        off_deg: Angles of the foot at the last contact, degrees; positive: the heel is up.
-        cycle_s: Durations of the gait cycle that ends with the swing before the stance, seconds.
-        speed_m_s: Speeds in this cycle, metres per second.
-        stride: Ways of the foot in the swing before the stance, forward, as shares of the usual stride.
-    """
-
-    strike_s: list[float] = field(default_factory=list)
-    off_s: list[float] = field(default_factory=list)
-    place_m: list[FloatArray] = field(default_factory=list)
-    yaw_deg: list[float] = field(default_factory=list)
-    strike_deg: list[float] = field(default_factory=list)
-    off_deg: list[float] = field(default_factory=list)
-    cycle_s: list[float] = field(default_factory=list)
-    speed_m_s: list[float] = field(default_factory=list)
-    stride: list[float] = field(default_factory=list)
-
-
 class Plan:
     """The path of a body over the floor, its bouts of stepping, and its footprints.
 
@@ -152,7 +127,7 @@ class Plan:
         self, length_s: float, still_s: float, walker: Walker, on_the_spot: bool, rng: np.random.Generator
     ) -> None:
         self.walker, self.bouts = walker, list[Bout]()
-        self.feet = (Footprints(), Footprints())
+        self._prints: tuple[dict[str, list[Any]], ...] = (defaultdict(list), defaultdict(list))
         self._rng, for_places = rng.spawn(2)
         self._rows = [np.array([-3.0 * MARGIN_S, 0.0, 0.0, float(self._rng.uniform(-180, 180))])]
         self._stand_until(still_s + float(self._rng.uniform(0.3, 0.8)))
@@ -174,9 +149,17 @@ class Plan:
         rows = np.array(self._rows)
         self._path = CubicSpline(rows[:, 0], rows[:, 1:])
         self._place_feet(for_places)
-        for foot in self.feet:
-            foot.off_s.append(float("inf"))
-            foot.off_deg.append(0.0)
+        for number in (0, 1):
+            self._add_print(number, off_s=float("inf"), off_deg=0.0)
+
+    def footprints(self, number: int) -> dict[str, FloatArray]:
+        """Return the footprints of the left foot (0) or of the right foot (1), as the fields of `Foot`."""
+        return {name: np.array(values) for name, values in self._prints[number].items()}
+
+    def _add_print(self, number: int, **values: Any) -> None:
+        """Add values of the next footprint of a foot, by field of `Foot`."""
+        for name, value in values.items():
+            self._prints[number][name].append(value)
 
     @property
     def end_s(self) -> float:
@@ -302,14 +285,17 @@ class Plan:
     def _plant_first(self) -> None:
         """Put both feet beside the body at the start."""
         here = self._rows[-1][1:]
-        for number, foot in enumerate(self.feet):
-            foot.strike_s.append(-float("inf"))
-            foot.place_m.append(here[:2] + self._aside_of(number, here[2]))
-            foot.yaw_deg.append(here[2] + self._toe_out(number))
-            foot.strike_deg.append(0.0)
-            foot.cycle_s.append(1.1)
-            foot.speed_m_s.append(0.0)
-            foot.stride.append(0.0)
+        for number in (0, 1):
+            self._add_print(
+                number,
+                strike_s=-float("inf"),
+                place_m=here[:2] + self._aside_of(number, here[2]),
+                yaw_deg=here[2] + self._toe_out(number),
+                strike_deg=0.0,
+                cycle_s=1.1,
+                speed_m_s=0.0,
+                stride=0.0,
+            )
 
     def _aside_of(self, number: int, yaw_deg: float) -> FloatArray:
         """Return the way (2,) in metres from the body to a foot."""
@@ -326,7 +312,7 @@ class Plan:
             steps = np.diff(bout.strikes_s, prepend=bout.start_s)
             for index, (strike, step) in enumerate(zip(bout.strikes_s, steps, strict=True)):
                 number = (bout.first + index) % 2
-                foot = self.feet[number]
+                before = self._prints[number]["place_m"][-1]
                 cycle = (
                     float(steps[max(index, 1) - 1 : index + 2].mean()) * 2.0
                     if bout.kind == "walk"
@@ -346,7 +332,7 @@ class Plan:
                 if not last and bout.kind == "walk":
                     place = place + 0.008 * rng.normal(size=2)
                 yaw = float(body[2]) + self._toe_out(number)
-                stride = float((place - foot.place_m[-1]) @ _forward(yaw)) / usual
+                stride = float((place - before) @ _forward(yaw)) / usual
                 off = float(strike - (1.0 - share) * cycle)
                 if index and bout.kind == "walk":
                     # The last steps take longer. The foot behind leaves the floor when it usually does.
@@ -356,16 +342,19 @@ class Plan:
                 if bout.kind == "walk":
                     at = self.body(np.array([strike, off]))
                     ahead = float((place - at[0, :2]) @ _forward(at[0, 2])) / (_AHEAD * usual)
-                    behind = float((at[1, :2] - foot.place_m[-1]) @ _forward(at[1, 2])) / (_BEHIND * usual)
-                foot.off_s.append(off)
-                foot.off_deg.append(_OFF_DEG[bout.kind] * float(np.clip(behind, 0.2, 1.15)) ** 0.7)
-                foot.strike_s.append(float(strike))
-                foot.place_m.append(place)
-                foot.yaw_deg.append(yaw)
-                foot.strike_deg.append(_STRIKE_DEG[bout.kind] * float(np.clip(ahead, 0.0, 1.15)))
-                foot.cycle_s.append(cycle)
-                foot.speed_m_s.append(bout.speed_m_s)
-                foot.stride.append(stride)
+                    behind = float((at[1, :2] - before) @ _forward(at[1, 2])) / (_BEHIND * usual)
+                self._add_print(
+                    number,
+                    off_s=off,
+                    off_deg=_OFF_DEG[bout.kind] * float(np.clip(behind, 0.2, 1.15)) ** 0.7,
+                    strike_s=float(strike),
+                    place_m=place,
+                    yaw_deg=yaw,
+                    strike_deg=_STRIKE_DEG[bout.kind] * float(np.clip(ahead, 0.0, 1.15)),
+                    cycle_s=cycle,
+                    speed_m_s=bout.speed_m_s,
+                    stride=stride,
+                )
 
 
 def smooth_step(x: FloatArray) -> FloatArray:

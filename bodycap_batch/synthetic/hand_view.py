@@ -64,7 +64,7 @@ def with_hand_in_view(mount: Mount, skeleton: SkeletonModel, camera: Camera, sha
         turned = rays @ pose[:3, :3].T
         origins = np.broadcast_to(pose[:3, 3], turned.shape)
         cast = np.concatenate([origins, turned], axis=1).astype(np.float32)
-        seen = np.any([limb.first_face(cast) != NOTHING for limb in limbs], axis=0)
+        seen = np.any([limb.first_hit(cast)[0] != NOTHING for limb in limbs], axis=0)
         if abs(seen.mean() - share) < least:
             found, least = pose, abs(float(seen.mean()) - share)
     return replace(mount, joint_from_cam=found)

@@ -14,7 +14,7 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.formats.atomic_files import write_text
 from bodycap_batch.model.geometry import so3_exp, so3_log
-from bodycap_batch.model.gravity import GRAVITY_M_S2
+from bodycap_batch.model.gravity import GRAVITY_M_S2, STANDARD_GRAVITY_M_S2
 from bodycap_batch.synthetic.options import ImuOptions
 
 _NOISE_RATE_HZ = 100.0
@@ -56,7 +56,12 @@ def write_imu(
     columns = []
     for values, bias, noise, limit in (
         (rate, biases[0], options.gyro_noise_rad_s, np.radians(options.gyro_range_deg_s)),
-        (force, biases[1], options.accelerometer_noise_m_s2, options.accelerometer_range_g * 9.80665),
+        (
+            force,
+            biases[1],
+            options.accelerometer_noise_m_s2,
+            options.accelerometer_range_g * STANDARD_GRAVITY_M_S2,
+        ),
     ):
         measured = values @ cam_from_sensor + bias + rng.normal(0.0, 1.0, values.shape) * noise * grown
         columns.append(np.clip(measured, -limit, limit))

@@ -81,8 +81,7 @@ def light_surfaces(surfaces: Sequence[Surface], lamps: FloatArray, rng: np.rando
 
 def _light_grid(surface: Surface) -> FloatArray:
     """Return the world positions (R,C,3) of a grid of points on a surface, metres."""
-    rows = max(2, int(np.linalg.norm(surface.down) / _CELL_M) + 1)
-    columns = max(2, int(np.linalg.norm(surface.across) / _CELL_M) + 1)
+    columns, rows = (max(2, int(side / _CELL_M) + 1) for side in surface.size_m)
     v, u = np.meshgrid(np.linspace(0.02, 0.98, rows), np.linspace(0.02, 0.98, columns), indexing="ij")
     return np.asarray(surface.corner + u[..., None] * surface.across + v[..., None] * surface.down)
 

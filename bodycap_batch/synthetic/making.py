@@ -213,9 +213,10 @@ def _write_videos(
     with _single_opencv_thread(), ThreadPoolExecutor(max_workers=max(1, context.threads)) as pool:
         for renderer, seed in zip(renderers, subject.seeds["images"].spawn(len(renderers)), strict=True):
             camera = renderer.mount.camera
-            times_s = clocks[camera].common_s(seconds_from_ns(frame_times_ns(options, camera)))
-            frames = np.flatnonzero(kept[camera]).tolist()
+            frames = np.flatnonzero(kept[camera])
+            times_s = clocks[camera].common_s(seconds_from_ns(frame_times_ns(options, camera)[frames]))
             sensor = Sensor(options.noise, 3 * options.width * options.height, seed)
+            exposure = AutoExposure(options.auto_exposure, 1.0 / options.fps)
             with VideoWriter(
                 folder / f"{camera}.mp4",
                 options.fps,
@@ -223,33 +224,15 @@ def _write_videos(
                 options.quality,
                 sound=None if sounds is None else sounds.of_camera(camera),
                 bit_rate_mbps=options.bit_rate_mbps,
-                data=_orientations(options, renderer, times_s[frames]),
+                data=_orientations(options, renderer, times_s),
             ) as video:
-                for image in _recorded(options, renderer, sensor, times_s, frames, pool, context):
-                    video.add(image)
+                images = _render_in_order(pool, renderer.render, times_s.tolist(), context)
+                for frame, image in zip(frames.tolist(), images, strict=True):
+                    video.add(sensor.record(image, frame, exposure.gain(image)))
                     done += 1
                     context.progress(done, total, camera)
             if options.stabilised != "none":
                 append_settings(folder / f"{camera}.mp4", GOPRO_SETTINGS)
-
-
-def _recorded(  # noqa: PLR0913, PLR0917 - one value each
-    options: SynthOptions,
-    renderer: MovingCamera,
-    sensor: Sensor,
-    times_s: FloatArray,
-    frames: list[int],
-    pool: ThreadPoolExecutor,
-    context: StageContext,
-) -> Iterator[Bytes]:
-    """Yield the recorded frames of a camera, which are rendered at given times in several threads."""
-
-    def ideal(frame: int) -> Bytes:
-        return renderer.render(float(times_s[frame]))
-
-    exposure = AutoExposure(options.auto_exposure, 1.0 / options.fps)
-    for frame, image in zip(frames, _render_in_order(pool, ideal, frames, context), strict=True):
-        yield sensor.record(image, frame, exposure.gain(image))
 
 
 def _orientations(options: SynthOptions, renderer: MovingCamera, common_s: FloatArray) -> DataTrack | None:
@@ -312,16 +295,16 @@ def walked_extent_m(options: SynthOptions, subject: Subject) -> tuple[float, flo
 
 
 def _render_in_order(
-    pool: ThreadPoolExecutor, recorder: Callable[[int], Bytes], frames: list[int], context: StageContext
+    pool: ThreadPoolExecutor, render: Callable[[float], Bytes], times_s: list[float], context: StageContext
 ) -> Iterator[Bytes]:
-    """Render frames in several threads, and yield them in order.
+    """Render the frames of several times in several threads, and yield them in order.
 
     Only a few frames are in memory at a time.
     """
     waiting: deque[Future[Bytes]] = deque()
     try:
-        for frame in frames:
-            waiting.append(pool.submit(recorder, frame))
+        for time_s in times_s:
+            waiting.append(pool.submit(render, time_s))
             if len(waiting) > 2 * max(1, context.threads):
                 context.check_cancelled()
                 yield waiting.popleft().result()

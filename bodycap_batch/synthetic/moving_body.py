@@ -7,8 +7,9 @@ from typing import Protocol
 import numpy as np
 
 from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.model.geometry import make_transform
 from bodycap_batch.model.skeleton import Mount, SkeletonModel, forward_kinematics
-from bodycap_batch.synthetic.stabilisation import turn_of_pictures, turned_poses
+from bodycap_batch.synthetic.stabilisation import turn_of_pictures
 
 
 class MovingBody(Protocol):
@@ -41,4 +42,4 @@ def picture_poses_at(motion: MovingBody, mount: Mount, t_s: FloatArray, *, stabi
     if not stabilised:
         return poses
     turns = turn_of_pictures(lambda times_s: camera_poses_at(motion, mount, times_s), t_s)
-    return turned_poses(poses, turns)
+    return np.asarray(poses @ make_transform(turns, np.zeros(3)))

@@ -281,9 +281,9 @@ def _find_jumps(cells: Float32, plane: IntArray) -> BoolArray:
     for axis in (0, 1):
         difference = np.abs(np.diff(cells, axis=axis + 1)).sum(axis=0).max(axis=-1)
         found = (difference > _JUMP_PX) & (np.diff(plane, axis=axis) != 0)
-        one, other = (slice(None, -1), slice(1, None))
-        jump[(one, slice(None)) if axis == 0 else (slice(None), one)] |= found
-        jump[(other, slice(None)) if axis == 0 else (slice(None), other)] |= found
+        along = np.moveaxis(jump, axis, 0)
+        along[:-1] |= np.moveaxis(found, axis, 0)
+        along[1:] |= np.moveaxis(found, axis, 0)
     return jump
 
 

@@ -27,15 +27,11 @@ _MAX_RATE_HZ = 2000.0
 """Maximum samples per second of an inertial sensor. Sensors of cameras have 100 to 1,600. Evidence: none."""
 _MAX_DELAY_S = 1.0
 """Maximum delay of an inertial sensor, seconds. Evidence: none."""
-_PERFECT = {
-    "gyro_noise_rad_s": 0.0,
-    "accelerometer_noise_m_s2": 0.0,
-    "gyro_bias_rad_s": 0.0,
-    "accelerometer_bias_m_s2": 0.0,
-    "turned_deg": 0.0,
-    "late_s": 0.0,
-}
-"""Options of a sensor without errors."""
+_ERRORS = (
+    *("gyro_noise_rad_s", "accelerometer_noise_m_s2", "gyro_bias_rad_s", "accelerometer_bias_m_s2"),
+    *("turned_deg", "late_s"),
+)
+"""Options of `ImuOptions` that are 0 for a sensor without errors."""
 
 
 class ImuOptions(Options):
@@ -80,7 +76,7 @@ def imu_from_word(value: Any) -> Any:
     if value is True or value == "consumer":
         return {}
     if value == "perfect":
-        return _PERFECT
+        return dict.fromkeys(_ERRORS, 0.0)
     return None if value is False else value
 
 

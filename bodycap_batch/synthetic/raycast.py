@@ -30,14 +30,6 @@ class RayScene:
         self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)
         self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(faces))
 
-    def first_face(self, rays: _Float32) -> IntArray:
-        """Return the index (N,) of the first face on each ray, or `NOTHING`.
-
-        Args:
-            rays: (N,6) origin and direction vector of each ray.
-        """
-        return self.first_hit(rays)[0]
-
     def first_hit(self, rays: _Float32) -> tuple[IntArray, _Float32]:
         """Return the index (N,) of the first face on each ray, or `NOTHING`, and the distances (N,).
 

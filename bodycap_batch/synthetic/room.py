@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
+import numpy.typing as npt
 
 from bodycap_batch.core.arrays import FloatArray
 from bodycap_batch.model.geometry import so3_exp
@@ -98,7 +99,7 @@ class _Builder:
 
     def textured(self, face: Surface, texture: Texture, detail: float = 1.0) -> None:
         """Add a face with a new image of a texture. Narrow faces get a metal texture."""
-        size = float(np.linalg.norm(face.across)), float(np.linalg.norm(face.down))
+        size = face.size_m
         if min(size) < _EDGE_M:
             texture = textures.metal
         image = self.image(size, texture, detail)
@@ -106,16 +107,14 @@ class _Builder:
             image = textures.faded(image, self.texture, self.texels_per_m, self.rng())
         self.surfaces.append(replace(face, image=image))
 
-    def box(
-        self, centre: FloatArray, size_m: tuple[float, float, float], yaw_deg: float, texture: Texture
-    ) -> None:
+    def box(self, centre: FloatArray, size_m: npt.ArrayLike, yaw_deg: float, texture: Texture) -> None:
         """Add the visible faces of a box, each with a new image of a texture.
 
         The bottom is visible only if it is above the floor.
         """
-        for index, face in enumerate(box_faces(centre, size_m, yaw_deg)):
-            if index < 5 or centre[2] - size_m[2] / 2 > 0.05:
-                self.textured(face, texture)
+        visible = 6 if centre[2] - np.asarray(size_m)[2] / 2 > 0.05 else 5
+        for face in box_faces(centre, size_m, yaw_deg)[:visible]:
+            self.textured(face, texture)
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,10 +217,9 @@ def _build_shell(build: _Builder, half: list[float], plain: frozenset[str]) -> l
         plain: Names of the plain surfaces. There are no carpets on a plain floor.
     """
     up = np.array([0.0, 0.0, 1.0])
-    floor, ceiling = box_faces([0, 0, HEIGHT_M / 2], [2 * half[0], 2 * half[1], HEIGHT_M], 0.0)[4:][::-1]
-    build.textured(_seen_from_behind(floor), textures.plaster if "floor" in plain else textures.planks)
-    panels = textures.plaster if "ceiling" in plain else textures.ceiling_panels
-    build.textured(_seen_from_behind(ceiling), panels)
+    floor, ceiling = _floor_and_ceiling(half)
+    build.textured(floor, textures.plaster if "floor" in plain else textures.planks)
+    build.textured(ceiling, textures.plaster if "ceiling" in plain else textures.ceiling_panels)
     rng = build.rng()
     for x, y in () if "floor" in plain else _CARPETS:
         size = (rng.uniform(1.3, 2.2), rng.uniform(1.0, 1.6), 0.012)
@@ -229,25 +227,21 @@ def _build_shell(build: _Builder, half: list[float], plain: frozenset[str]) -> l
         texture = textures.carpet if rng.uniform() < 0.75 else textures.tiles
         build.textured(box_faces(centre, size, float(rng.uniform(-25, 25)))[4], texture)
     walls = []
-    materials = (
-        textures.plaster,
-        textures.plaster if "east" in plain else textures.bricks,
-        textures.plaster,
-        textures.plaster,
-    )
-    for angle, texture in zip((90, 0, 270, 180), materials, strict=True):
+    for name, angle in zip(_WALL_NAMES, (90, 0, 270, 180), strict=True):
         # The wall is in the direction `outward` from the room's middle, and faces the middle.
         outward = np.round([np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.0], 12)
         axis = int(np.argmax(np.abs(outward)))
         wall = _Wall(outward * half[axis], np.cross(up, -outward), -outward, 2 * half[1 - axis])
         walls.append(wall)
-        build.textured(_face_of(wall), texture)
+        has_bricks = name == "east" and name not in plain
+        build.textured(_face_of(wall), textures.bricks if has_bricks else textures.plaster)
     return walls
 
 
-def _seen_from_behind(face: Surface) -> Surface:
-    """Return a rectangle at the same position. Its image is on the opposite side."""
-    return replace(face, corner=face.corner + face.across, across=-face.across)
+def _floor_and_ceiling(half: list[float]) -> list[Surface]:
+    """Return the floor and the ceiling of a room, whose images are inside, without images."""
+    ceiling, floor = box_faces([0, 0, HEIGHT_M / 2], [2 * half[0], 2 * half[1], HEIGHT_M], 0.0)[4:]
+    return [replace(face, corner=face.corner + face.across, across=-face.across) for face in (floor, ceiling)]
 
 
 def _add_shelves(build: _Builder, wall: _Wall) -> None:
@@ -296,7 +290,7 @@ def _add_desks(build: _Builder, wall: _Wall) -> None:
             spot = wall.point_at(
                 along + rng.uniform(-0.5, 0.5) * wide, 0.74 + block[2] / 2, rng.uniform(0.35, 0.6)
             )
-            build.box(spot, (block[0], block[1], block[2]), float(rng.uniform(0, 90)), pictures.cardboard)
+            build.box(spot, block, float(rng.uniform(0, 90)), pictures.cardboard)
 
 
 def _add_cupboards(build: _Builder, wall: _Wall) -> None:
@@ -314,12 +308,12 @@ def _add_cupboards(build: _Builder, wall: _Wall) -> None:
 def _add_sofa(build: _Builder, wall: _Wall) -> None:
     """Add a sofa, a pile of boxes and a partition at a wall."""
     rng = build.rng()
-    build.box(wall.point_at(-0.9, 0.22, 0.42), (1.9, 0.8, 0.42), wall.yaw_deg, textures.fabric)
-    build.box(wall.point_at(-0.9, 0.62, 0.12), (1.9, 0.22, 0.40), wall.yaw_deg, textures.fabric)
-    for side in (-1, 1):
-        build.box(
-            wall.point_at(-0.9 + side * 0.85, 0.53, 0.45), (0.2, 0.75, 0.2), wall.yaw_deg, textures.fabric
-        )
+    for place, size in (
+        ((-0.9, 0.22, 0.42), (1.9, 0.8, 0.42)),
+        ((-0.9, 0.62, 0.12), (1.9, 0.22, 0.40)),
+        *(((-0.9 + side * 0.85, 0.53, 0.45), (0.2, 0.75, 0.2)) for side in (-1, 1)),
+    ):
+        build.box(wall.point_at(*place), size, wall.yaw_deg, textures.fabric)
     height = 0.0
     for _ in range(4):
         size = (rng.uniform(0.45, 0.65), rng.uniform(0.4, 0.55), rng.uniform(0.25, 0.4))
@@ -450,8 +444,7 @@ def _add_partition(build: _Builder, half: list[float]) -> None:
         centre = np.array([thick / 2, (low + high) / 2, (bottom + top) / 2])
         faces = box_faces(centre, (thick, high - low, top - bottom), 0.0)
         for face in (faces[0], faces[2], faces[3], faces[5]):
-            size = float(np.linalg.norm(face.across)), float(np.linalg.norm(face.down))
-            build.surfaces.append(replace(face, image=build.image(size, one_paint)))
+            build.surfaces.append(replace(face, image=build.image(face.size_m, one_paint)))
 
 
 def _add_table(build: _Builder) -> None:
@@ -460,35 +453,25 @@ def _add_table(build: _Builder) -> None:
     centre = np.array([*_TABLE, 0.0])
     build.box(centre + np.array([0, 0, _TABLE_TOP_M - 0.02]), (1.5, 0.7, 0.04), 0.0, textures.planks)
     for side in (-1, 1):
-        build.box(
-            centre + np.array([side * 0.66, 0, _TABLE_TOP_M / 2 - 0.02]),
-            (0.05, 0.6, _TABLE_TOP_M - 0.04),
-            0.0,
-            textures.metal,
-        )
+        leg = centre + np.array([side * 0.66, 0, _TABLE_TOP_M / 2 - 0.02])
+        build.box(leg, (0.05, 0.6, _TABLE_TOP_M - 0.04), 0.0, textures.metal)
     build.box(centre + np.array([-0.42, 0.22, _TABLE_TOP_M + 0.21]), (0.52, 0.04, 0.32), 8.0, pictures.screen)
     build.box(centre + np.array([-0.42, 0.22, _TABLE_TOP_M + 0.03]), (0.2, 0.14, 0.06), 8.0, textures.metal)
     for x, y in ((0.12, 0.22), (0.42, 0.1), (0.6, -0.15), (-0.6, -0.1)):
         size = rng.uniform(0.08, 0.2, 3)
         spot = centre + np.array([x, y, _TABLE_TOP_M + size[2] / 2])
-        build.box(spot, (size[0], size[1], size[2]), float(rng.uniform(0, 90)), pictures.cardboard)
+        build.box(spot, size, float(rng.uniform(0, 90)), pictures.cardboard)
     for x in (-0.3, 0.15):
-        sheet = box_faces(
-            centre + np.array([x, -0.15, _TABLE_TOP_M + 0.003]),
-            (0.3, 0.21, 0.006),
-            float(rng.uniform(-20, 20)),
-        )[4]
-        build.surfaces.append(
-            replace(sheet, image=build.image((0.3, 0.21), pictures.research_poster, _PICTURE_DETAIL))
-        )
+        place = centre + np.array([x, -0.15, _TABLE_TOP_M + 0.003])
+        sheet = box_faces(place, (0.3, 0.21, 0.006), float(rng.uniform(-20, 20)))[4]
+        image = build.image((0.3, 0.21), pictures.research_poster, _PICTURE_DETAIL)
+        build.surfaces.append(replace(sheet, image=image))
 
 
 def _add_flat_pictures(build: _Builder, half: list[float], walls: list[_Wall], options: SynthOptions) -> None:
     """Add flat pictures at random positions on the plain surfaces that were requested."""
-    floor, ceiling = box_faces([0, 0, HEIGHT_M / 2], [2 * half[0], 2 * half[1], HEIGHT_M], 0.0)[4:][::-1]
-    faces = {"floor": _seen_from_behind(floor), "ceiling": _seen_from_behind(ceiling)}
-    for name, wall in zip(_WALL_NAMES, walls, strict=True):
-        faces[name] = _face_of(wall)
+    faces = dict(zip(("floor", "ceiling"), _floor_and_ceiling(half), strict=True))
+    faces |= {name: _face_of(wall) for name, wall in zip(_WALL_NAMES, walls, strict=True)}
     for name in sorted(options.bare):
         rng = build.rng()
         for _ in range(options.flat_pictures):
@@ -498,7 +481,7 @@ def _add_flat_pictures(build: _Builder, half: list[float], walls: list[_Wall], o
 
 def _picture_on(build: _Builder, face: Surface, kind: Texture, rng: np.random.Generator) -> Surface:
     """Return a flat picture at a random position on a surface."""
-    lengths = np.array([np.linalg.norm(face.across), np.linalg.norm(face.down)])
+    lengths = np.array(face.size_m)
     size = rng.uniform(*_FLAT_PICTURE_M, 2)
     place = 0.5 * lengths + rng.uniform(-0.5, 0.5, 2) * _FLAT_PICTURE_SPREAD * (lengths - size) - size / 2
     right, down = face.across / lengths[0], face.down / lengths[1]
@@ -518,12 +501,8 @@ def _add_ceiling_fittings(build: _Builder, half: list[float]) -> None:
     build.box(np.array([0.35 * half[0], 0.0, HEIGHT_M - 0.25]), size, 90.0, textures.metal)
     for _ in range(6):
         spot = np.array([*(rng.uniform(-0.85, 0.85, 2) * half), HEIGHT_M - 0.03])
-        build.box(
-            spot,
-            (rng.uniform(0.15, 0.4), rng.uniform(0.12, 0.3), 0.06),
-            float(rng.uniform(0, 90)),
-            pictures.cardboard,
-        )
+        size = (rng.uniform(0.15, 0.4), rng.uniform(0.12, 0.3), 0.06)
+        build.box(spot, size, float(rng.uniform(0, 90)), pictures.cardboard)
 
 
 def _add_lamp_housings(build: _Builder, lamps: FloatArray) -> None:

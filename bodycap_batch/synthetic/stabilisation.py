@@ -17,13 +17,7 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.formats.gpmf_writer import item, nested
 from bodycap_batch.formats.mp4_writer import DataTrack
-from bodycap_batch.model.geometry import (
-    continuous_quat_xyzw,
-    make_transform,
-    nearest_rotation,
-    so3_exp,
-    so3_log,
-)
+from bodycap_batch.model.geometry import continuous_quat_xyzw, nearest_rotation, so3_exp, so3_log
 
 GOPRO_SETTINGS = {"MINF": "HERO11 Black", "EISE": "Y", "EISA": "HS High"}
 """Settings of a GoPro camera that stabilises its pictures."""
@@ -58,12 +52,6 @@ def turn_of_pictures(
     now = world_from_cam_at(times_s)[:, :3, :3]
     turn = so3_log(np.swapaxes(now, 1, 2) @ world_from_smooth)
     return so3_exp(turn / np.sqrt(1.0 + (turn**2).sum(axis=1, keepdims=True) / _MAX_TURN_RAD**2))
-
-
-def turned_poses(world_from_cam: FloatArray, cam_from_picture: FloatArray) -> FloatArray:
-    """Return the poses world_from_picture (T,4,4) of turned pictures."""
-    turned: FloatArray = world_from_cam @ make_transform(cam_from_picture, np.zeros(3))
-    return turned
 
 
 def orientation_track(

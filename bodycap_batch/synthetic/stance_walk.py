@@ -9,7 +9,7 @@ angles of both legs follow from the places of root and feet.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from bodycap_batch.core.arrays import BoolArray, FloatArray, IntArray
 from bodycap_batch.model.skeleton import SkeletonModel
 from bodycap_batch.synthetic.foot_roll import FootShape, foot_rotation, shape_of, toe_pitch_deg
-from bodycap_batch.synthetic.gait import WalkStyle
+from bodycap_batch.synthetic.gait import WalkStyle, local_rotations
 from bodycap_batch.synthetic.gait_curves import (
     REFERENCE_M_S,
     hip_flexion_deg,
@@ -28,8 +28,8 @@ from bodycap_batch.synthetic.gait_curves import (
     stance_share,
     steps_per_s,
 )
-from bodycap_batch.synthetic.gait_plan import MARGIN_S, Footprints, Plan, draw_walker, smooth_step
-from bodycap_batch.synthetic.pressing import ArmAngles
+from bodycap_batch.synthetic.gait_plan import MARGIN_S, Plan, draw_walker, smooth_step
+from bodycap_batch.synthetic.pressing import ArmAngles, rotation_about
 
 _SIDES = ("Left", "Right")
 _GRID_HZ = 100.0
@@ -80,10 +80,23 @@ _LIFT_DEG = {"hip": 12.0, "knee": 27.0}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Foot:
-    """One foot: its shape and its N stances, as arrays. `Footprints` explains the fields.
+class Foot:
+    """One foot: its shape and its N stances. The first one starts before the plan, the last ends after it.
 
-    `rise_power` (N,) is the power of the angle of the foot over time while the heel rises.
+    Attributes:
+        side: ``Left`` or ``Right``.
+        number: 0 for the left foot, 1 for the right foot.
+        shape: Its shape.
+        strike_s: (N,) times at which the foot touches the floor, seconds.
+        off_s: (N,) times at which the foot leaves the floor, seconds.
+        place_m: (N,2) places of the ankle above the floor, metres.
+        yaw_deg: (N,) directions of the foot, degrees; 0: towards −y. They do not jump by 360 degrees.
+        strike_deg: (N,) angles of the foot at the first contact, degrees; negative: the toes are up.
+        off_deg: (N,) angles of the foot at the last contact, degrees; positive: the heel is up.
+        cycle_s: (N,) durations of the gait cycle that ends with the swing before the stance, seconds.
+        speed_m_s: (N,) speeds in this cycle, metres per second.
+        stride: (N,) ways of the foot in the swing before the stance, forward, as shares of the usual stride.
+        rise_power: (N,) power of the angle of the foot over time while the heel rises.
     """
 
     side: str
@@ -122,14 +135,6 @@ class _Foot:
         return np.where(stands, 0.0, t_s - np.where(stands, 0.0, start)) / length, length
 
 
-def _as_arrays(side: str, number: int, shape: FootShape, prints: Footprints) -> _Foot:
-    """Return a foot with its footprints as arrays."""
-    arrays = {each.name: np.array(getattr(prints, each.name)) for each in fields(prints)}
-    return _Foot(
-        side=side, number=number, shape=shape, rise_power=np.full(len(prints.strike_s), _RISE_POWER), **arrays
-    )
-
-
 class StanceWalk:
     """A walk with stance: the pose of the body at any time.
 
@@ -163,27 +168,28 @@ class StanceWalk:
         self._style = style
         pace = steps_per_s(np.array(self.walker.speed_m_s), height_m) * self.walker.step_gain
         self._rise_sigma_s = _RISE_SIGMA * 2.0 / float(pace)
-        self._feet = tuple(
-            _as_arrays(side, number, shape_of(skeleton, side), prints)
-            for number, (side, prints) in enumerate(zip(_SIDES, self.plan.feet, strict=True))
-        )
+        self._feet = tuple(self._planned_foot(number, side) for number, side in enumerate(_SIDES))
         self._build_splines(for_arms)
         self._corrections = tuple(self._find_corrections(foot) for foot in self._feet)
+
+    def _planned_foot(self, number: int, side: str) -> Foot:
+        """Return a foot with the footprints of the plan."""
+        prints = self.plan.footprints(number)
+        power = np.full(len(prints["strike_s"]), _RISE_POWER)
+        return Foot(side=side, number=number, shape=shape_of(self.skeleton, side), rise_power=power, **prints)
 
     def pose(self, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return root positions (T,3) in the world (m) and local rotations (T,J,3,3) at common times (T,)."""
         t_s = np.asarray(t_s, dtype=np.float64)
         root, turns = self._root(t_s), self._turns(t_s)
-        pelvis = Rotation.from_euler("ZYX", turns[:, :3], degrees=True)
+        pelvis = rotation_about("ZYX", turns[:, :3])
         out = {"Hips": pelvis}
         for foot in self._feet:
             self._leg(foot, t_s, root, pelvis, out)
         self._trunk(turns, pelvis, out)
         for number, side in enumerate(_SIDES):
             self._arm(side, t_s, self._swings(t_s)[:, 2 * number : 2 * number + 2], out)
-        identity = Rotation.identity(len(t_s))
-        local = np.stack([out.get(name, identity).as_matrix() for name in self.skeleton.joints], axis=1)
-        return root, local
+        return root, local_rotations(self.skeleton, out, len(t_s))
 
     def contacts(self, start_s: float, end_s: float) -> dict[str, FloatArray]:
         """Return the stances (N,2) of each foot, by side: heel strike and toe off, seconds.
@@ -200,7 +206,7 @@ class StanceWalk:
     # The plan at one instant.
 
     @staticmethod
-    def _stance_pitch(foot: _Foot, index: IntArray, t_s: FloatArray) -> FloatArray:
+    def _stance_pitch(foot: Foot, index: IntArray, t_s: FloatArray) -> FloatArray:
         """Return the angle (T,) of a foot in the stances `index` (T,), degrees."""
         after = (t_s - foot.strike_s[index]) / (_FLAT_AT * foot.cycle_s[index])
         later = foot.after(index)
@@ -215,12 +221,12 @@ class StanceWalk:
             + foot.off_deg[index] * risen ** foot.rise_power[index]
         )
 
-    def _stance_ankle(self, foot: _Foot, index: IntArray, t_s: FloatArray) -> FloatArray:
+    def _stance_ankle(self, foot: Foot, index: IntArray, t_s: FloatArray) -> FloatArray:
         """Return the ankle (T,3) of a foot in the stances `index` (T,), metres."""
         pitch = self._stance_pitch(foot, index, t_s)
         return foot.shape.ankle_on_floor(foot.place_m[index], foot.yaw_deg[index], pitch)
 
-    def _foot_angles(self, foot: _Foot, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _foot_angles(self, foot: Foot, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return direction (T,) and angle (T,) of a foot, degrees."""
         index, later, stands = foot.stance_at(t_s)
         part, length = foot.swung(index, stands, t_s)
@@ -234,7 +240,7 @@ class StanceWalk:
         swing = foot.off_deg[index] * (1.0 - fall) + foot.strike_deg[later] * fall + coasting
         return yaw, np.asarray(np.where(stands, self._stance_pitch(foot, index, t_s), swing))
 
-    def _cycle(self, foot: _Foot, t_s: FloatArray) -> FloatArray:
+    def _cycle(self, foot: Foot, t_s: FloatArray) -> FloatArray:
         """Return the position (T,) in a leg's gait cycle, 0 to 1. It waits in the middle of long stances."""
         index, later, stands = foot.stance_at(t_s)
         share = stance_share(foot.speed_m_s[later])
@@ -246,7 +252,7 @@ class StanceWalk:
         part, _ = foot.swung(index, stands, t_s)
         return np.asarray(np.where(stands, held, share + part * (1.0 - share)))
 
-    def _knee_curve(self, foot: _Foot, t_s: FloatArray) -> FloatArray:
+    def _knee_curve(self, foot: Foot, t_s: FloatArray) -> FloatArray:
         """Return the flexion (T,) of the knee that the curves give, degrees."""
         index, later, stands = foot.stance_at(t_s)
         cycle = self._cycle(foot, t_s)
@@ -300,7 +306,7 @@ class StanceWalk:
         weights = self._weights(t_s)
         sway = self._sway(t_s, body, weights)
         root = np.column_stack([body[:, :2] + sway, np.zeros(len(t_s))])
-        pelvis = Rotation.from_euler("ZYX", turns[:, :3], degrees=True)
+        pelvis = rotation_about("ZYX", turns[:, :3])
         root[:, 2] = self._height(t_s, root, pelvis)[0]
         for _ in range(2):
             self._root = CubicSpline(t_s, root)
@@ -344,7 +350,7 @@ class StanceWalk:
         excess = maximum_filter1d(wanted - reached, 2 * around + 1)
         return wanted, np.asarray(wanted - gaussian_filter1d(excess, _SPREAD, radius=around))
 
-    def _with_rise(self, foot: _Foot) -> _Foot:
+    def _with_rise(self, foot: Foot) -> Foot:
         """Return a foot whose heel rises so that its knee has the angle of the curve when both feet stand.
 
         The time at which the other foot strikes counts.
@@ -359,8 +365,7 @@ class StanceWalk:
         )
         both_s = self._both_s(foot, later)
         at = foot.off_s[index] - both_s
-        pelvis = Rotation.from_euler("ZYX", self._turns(at)[:, :3], degrees=True)
-        hip = self._root(at) + pelvis.apply(self._hips_m[foot.number])
+        hip = self._hip_at(foot, at)
         wanted = self._reach_m(np.maximum(self._knee_curve(foot, at), _STRAIGHTEST_KNEE_DEG))
         tried = np.linspace(0.0, 1.0, 60)
         misfit = []
@@ -375,7 +380,7 @@ class StanceWalk:
         return replace(foot, rise_power=powers)
 
     @staticmethod
-    def _both_s(foot: _Foot, index: IntArray) -> FloatArray:
+    def _both_s(foot: Foot, index: IntArray) -> FloatArray:
         """Return the time (T,) in seconds for which both feet stand around the swings to `index` (T,)."""
         share = stance_share(foot.speed_m_s[index]) - 0.5
         return np.asarray(np.maximum(share, 0.05) * foot.cycle_s[index])
@@ -428,7 +433,7 @@ class StanceWalk:
 
     # The legs.
 
-    def _curve_ankle(self, foot: _Foot, index: IntArray, t_s: FloatArray) -> FloatArray:
+    def _curve_ankle(self, foot: Foot, index: IntArray, t_s: FloatArray) -> FloatArray:
         """Return the ankle (T,3) of the curves in the swings after the stances `index` (T,), metres."""
         later = index + 1
         start, end = foot.off_s[index], foot.strike_s[later]
@@ -450,11 +455,14 @@ class StanceWalk:
                 -self._thigh_m * np.cos(thigh) - self._shank_m * np.cos(shank),
             ]
         )
-        pelvis = Rotation.from_euler("ZYX", self._turns(t_s)[:, :3], degrees=True)
-        hips = self._root(t_s) + pelvis.apply(self._hips_m[foot.number])
-        return np.asarray(hips + Rotation.from_euler("Z", yaw[:, None], degrees=True).apply(leg))
+        return np.asarray(self._hip_at(foot, t_s) + rotation_about("Z", yaw).apply(leg))
 
-    def _find_corrections(self, foot: _Foot) -> FloatArray:
+    def _hip_at(self, foot: Foot, t_s: FloatArray) -> FloatArray:
+        """Return the hip (T,3) of a leg, metres."""
+        pelvis = rotation_about("ZYX", self._turns(t_s)[:, :3])
+        return np.asarray(self._root(t_s) + pelvis.apply(self._hips_m[foot.number]))
+
+    def _find_corrections(self, foot: Foot) -> FloatArray:
         """Return the corrections (N−1,4,3) of the swings of a foot: place and speed, at start and end."""
         count = len(foot.strike_s) - 1
         index = np.arange(count)
@@ -470,7 +478,7 @@ class StanceWalk:
         out[:, 3, :2] += _LANDING_SHARE * self._root(foot.strike_s[1:], 1)[:, :2]
         return out
 
-    def _ankle(self, foot: _Foot, t_s: FloatArray, yaw_deg: FloatArray, pitch_deg: FloatArray) -> FloatArray:
+    def _ankle(self, foot: Foot, t_s: FloatArray, yaw_deg: FloatArray, pitch_deg: FloatArray) -> FloatArray:
         """Return the ankle (T,3) of a foot, metres."""
         index, _, stands = foot.stance_at(t_s)
         out = self._stance_ankle(foot, index, t_s)
@@ -495,8 +503,7 @@ class StanceWalk:
         least = _CLEARANCE_M * np.sin(np.pi * x) ** 2
         soft = _SOFT_CLEARANCE_M * np.sin(np.pi * x) ** 2 + 1e-9
         ankle[:, 2] = least - soles + soft * np.logaddexp(0.0, (ankle[:, 2] + soles - least) / soft)
-        pelvis = Rotation.from_euler("ZYX", self._turns(at)[:, :3], degrees=True)
-        hips = self._root(at) + pelvis.apply(self._hips_m[foot.number])
+        hips = self._hip_at(foot, at)
         way = ankle - hips
         distance = np.linalg.norm(way, axis=1)
         longest = float(self._reach_m(np.array(_STRAIGHTEST_KNEE_DEG)))
@@ -505,7 +512,7 @@ class StanceWalk:
         return out
 
     def _leg(
-        self, foot: _Foot, t_s: FloatArray, root: FloatArray, pelvis: Rotation, out: dict[str, Rotation]
+        self, foot: Foot, t_s: FloatArray, root: FloatArray, pelvis: Rotation, out: dict[str, Rotation]
     ) -> None:
         """Add the rotations of hip, knee, ankle and toes of one leg, so that the foot has its place."""
         yaw, pitch = self._foot_angles(foot, t_s)
@@ -529,9 +536,7 @@ class StanceWalk:
         out[f"{foot.side}UpLeg"] = pelvis.inv() * thigh
         out[f"{foot.side}Leg"] = bend
         out[f"{foot.side}Foot"] = (thigh * bend).inv() * flat
-        out[f"{foot.side}ToeBase"] = Rotation.from_euler(
-            "X", (toe_pitch_deg(pitch) - pitch)[:, None], degrees=True
-        )
+        out[f"{foot.side}ToeBase"] = rotation_about("X", toe_pitch_deg(pitch) - pitch)
 
     # Trunk, head and arms.
 
@@ -543,21 +548,15 @@ class StanceWalk:
             angles = np.column_stack(
                 [share * (turns[:, 4] + turn), share * turns[:, 5], share * (turns[:, 3] + bend)]
             )
-            out[name] = Rotation.from_euler("ZYX", angles, degrees=True)
+            out[name] = rotation_about("ZYX", angles)
             chest = chest * out[name]
-        level = Rotation.from_euler(
-            "ZX", np.column_stack([turns[:, 6], np.full(len(turns), 3.0)]), degrees=True
-        )
+        level = rotation_about("ZX", np.column_stack([turns[:, 6], np.full(len(turns), 3.0)]))
         half = Rotation.from_rotvec(0.5 * (chest.inv() * level).as_rotvec())
         out["Neck"] = out["Head"] = half
 
     def _arm(self, side: str, t_s: FloatArray, swing: FloatArray, out: dict[str, Rotation]) -> None:
         """Add the rotations of clavicle, shoulder, elbow and wrist of one arm."""
-        outward = 1.0 if side == "Left" else -1.0
-        held = {
-            part: self._style.posture.get(side + part, 0.0)
-            for part in ("Lift", "Ahead", "Arm", "Out", "Spin", "Elbow", "Twist")
-        }
+        outward, held = 1.0 if side == "Left" else -1.0, self._style.held(side)
         ahead = self._style.arms_ahead
         angles = ArmAngles(
             flexion=-3.0 + held["Arm"] + 25.0 * ahead + (1.0 - 0.6 * ahead) * swing[:, 0],
@@ -568,16 +567,11 @@ class StanceWalk:
             wrist=0.1 * swing[:, 0],
             radial=np.zeros_like(t_s),
         )
-        for press in self._style.presses:
-            if press.side == side:
-                angles = press.blended(angles, t_s)
-        shoulder = Rotation.from_euler(
-            "ZY", np.tile([-outward * held["Ahead"], -outward * held["Lift"]], (len(t_s), 1)), degrees=True
-        )
-        out[f"{side}Shoulder"] = shoulder
         end_s = self._style.t_pose_s
         free = smooth_step(t_s - end_s) if end_s else np.ones_like(t_s)
-        out.update(angles.rotations(side, free))
+        angles, lift = self._style.pressed(side, angles, np.zeros_like(t_s), t_s)
+        turns = outward * np.column_stack([np.full_like(t_s, held["Ahead"]), lift + held["Lift"]])
+        out.update({f"{side}Shoulder": rotation_about("ZY", -turns), **angles.rotations(side, free)})
 
 
 def _slow_drift(t_s: FloatArray, rng: np.random.Generator, count: int) -> FloatArray:

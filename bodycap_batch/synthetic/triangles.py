@@ -44,6 +44,11 @@ class Surface:
         normal = np.cross(self.down, self.across)
         return np.asarray(normal / np.linalg.norm(normal))
 
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height, metres."""
+        return float(np.linalg.norm(self.across)), float(np.linalg.norm(self.down))
+
     def corners(self) -> FloatArray:
         """Return the world positions (4,3) of the corners: top left, top right, bottom right, bottom left."""
         edges = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) @ np.stack([self.across, self.down])

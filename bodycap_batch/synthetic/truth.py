@@ -15,20 +15,13 @@ import numpy as np
 from bodycap_batch.core.arrays import FloatArray, IntArray
 from bodycap_batch.formats.atomic_files import atomic_replacement, write_text
 from bodycap_batch.formats.bvh import write_bvh
+from bodycap_batch.formats.joint_positions import ROLE_BY_TRUTH_NAME
 from bodycap_batch.model.geometry import invert, make_transform, quat_xyzw_from_rotation, so3_exp, so3_log
 from bodycap_batch.model.skeleton import Motion, Mount, SkeletonModel
 from bodycap_batch.synthetic.clocks import has_own_clocks, reference_name, true_clocks
 from bodycap_batch.synthetic.moving_body import MovingBody, joint_poses_at
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.synthetic.stance_walk import StanceWalk
-
-JOINT_ROLES = {
-    "root": "Hips", "torso": "Spine1", "head": "Head", "left_palm": "LeftHand", "right_palm": "RightHand",
-    "left_elbow": "LeftForeArm", "right_elbow": "RightForeArm", "left_shoulder": "LeftArm",
-    "right_shoulder": "RightArm", "left_knee": "LeftLeg", "right_knee": "RightLeg", "left_hip": "LeftUpLeg",
-    "right_hip": "RightUpLeg", "left_ankle": "LeftFoot", "right_ankle": "RightFoot",
-}  # fmt: skip
-"""Role of a joint in the skeleton for each name in ``gt/joints.npz``."""
 
 _README = """Ground truth of a synthetic capture. Metres, Z up, floor at z = 0.
 
@@ -195,8 +188,8 @@ def _rest_pose_motion(skeleton: SkeletonModel, fps: float) -> Motion:
 
 
 def _write_joints(path: Path, motion: MovingBody, ticks_ns: IntArray) -> None:
-    """Write the world positions of the joints in `JOINT_ROLES` at given common times (nanoseconds)."""
-    indices = {name: motion.skeleton.index_of_role(role) for name, role in JOINT_ROLES.items()}
+    """Write the world positions of the joints in `ROLE_BY_TRUTH_NAME` at given common times (nanoseconds)."""
+    indices = {name: motion.skeleton.index_of_role(role) for name, role in ROLE_BY_TRUTH_NAME.items()}
     present = {name: index for name, index in indices.items() if index is not None}
     world = joint_poses_at(motion, seconds_from_ns(ticks_ns))[:, list(present.values())][..., :3, 3]
     with atomic_replacement(path) as temporary:

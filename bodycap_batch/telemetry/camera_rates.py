@@ -13,10 +13,9 @@ from bodycap_batch.model.geometry import so3_log
 from bodycap_batch.model.gyro_rates import GyroRates
 from bodycap_batch.model.rotation_fit import MatchedRays, fit_to_rays
 from bodycap_batch.telemetry.comparison import judge_rotations
-from bodycap_batch.telemetry.gyro_fit import GyroFit
 from bodycap_batch.telemetry.match_fit import fit_to_matches
 from bodycap_batch.telemetry.picture_rotation import PictureRotation
-from bodycap_batch.telemetry.streams import CameraTelemetry, Stream
+from bodycap_batch.telemetry.streams import CameraTelemetry
 
 _MAX_FOCAL_CHANGE = 0.06
 """Maximum difference of the focal ratio from 1. With a larger one, the angles that the pictures of a camera
@@ -64,10 +63,16 @@ def relate_gyro(camera: CaptureCamera, matches: FrameMatches, telemetry: CameraT
     better = None
     if stated_s is not None or not camera.may_be_sideways:
         better = fit_to_matches(rays, times_s, gyro, camera.camera, compared.fit, stated_s)
-    if better is None:
-        return RelatedGyro(rates=_rates(gyro, compared.fit), reason=compared.reason)
-    readout = (better.readout_s, better.readout_sigma_s)
-    return RelatedGyro(rates=_rates(gyro, better.fit, readout), reason=compared.reason)
+    fit, readout_s, readout_sigma_s = better or (compared.fit, float("nan"), float("inf"))
+    on_clock_s, rate_rad_s = fit.in_camera(gyro)
+    rates = GyroRates(
+        times_s=on_clock_s,
+        rate_rad_s=rate_rad_s,
+        gaps_s=np.array(gyro.gaps_s).reshape(-1, 2) - fit.delay_s,
+        readout_s=readout_s,
+        readout_sigma_s=readout_sigma_s,
+    )
+    return RelatedGyro(rates=rates, reason=compared.reason)
 
 
 def _rotations(step: FloatArray, times_s: FloatArray, known: BoolArray) -> PictureRotation:
@@ -75,18 +80,4 @@ def _rotations(step: FloatArray, times_s: FloatArray, known: BoolArray) -> Pictu
         start_s=times_s[:-1][known],
         end_s=times_s[1:][known],
         turn_rad=-so3_log(step).reshape(-1, 3),
-    )
-
-
-def _rates(
-    gyro: Stream, fit: GyroFit, readout: tuple[float, float] = (float("nan"), float("inf"))
-) -> GyroRates:
-    """Return the samples in the axes and on the clock of the camera."""
-    delay_s = fit.delay_s + fit.drift * (gyro.times_s - fit.middle_s)
-    return GyroRates(
-        times_s=gyro.times_s - delay_s,
-        rate_rad_s=(gyro.values - fit.bias_rad_s) @ fit.cam_from_sensor.T,
-        gaps_s=np.array(gyro.gaps_s).reshape(-1, 2) - fit.delay_s,
-        readout_s=readout[0],
-        readout_sigma_s=readout[1],
     )

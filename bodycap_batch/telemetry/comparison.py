@@ -180,18 +180,17 @@ def all_times_ns(camera: CaptureCamera, config: CameraConfig) -> IntArray:
     return join_chapters(camera.videos, config.timestamps).times_ns
 
 
-def telemetry_notes(spec: CaptureConfig, threads: int = 1) -> list[str]:
+def telemetry_notes(spec: CaptureConfig) -> list[str]:
     """Return notes on damaged telemetry, timelapses, and videos that the gyroscope shows to be stabilised.
 
     Args:
         spec: The capture block of a job, as returned by `load_job`.
-        threads: Number of threads of each decoder.
     """
     notes = []
     small = spec.model_copy(update={"work_px": min(spec.work_px, WORK_PX)})
     for config in spec.cameras:
         try:
-            camera = open_camera(small, config.model_copy(update={"mask": None}), threads)
+            camera = open_camera(small, config.model_copy(update={"mask": None}), threads=1)
             telemetry = read_telemetry(camera.videos, all_times_ns(camera, config), config.samples)
             notes += [f"{config.name}: {note}" for note in telemetry.notes]
             compared = compare_picture_and_gyro(camera, telemetry)

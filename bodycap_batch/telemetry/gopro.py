@@ -25,6 +25,7 @@ from bodycap_batch.formats.gpmf import (
     gopro_stabilisation,
     read_items,
 )
+from bodycap_batch.model.gravity import STANDARD_GRAVITY_M_S2
 from bodycap_batch.telemetry.stream_clock import MAX_SAMPLES, Payload, StreamClock, fit_stream_clock
 from bodycap_batch.telemetry.streams import (
     ACCELEROMETER,
@@ -70,7 +71,7 @@ _PROPERTIES = frozenset(
 _VECTORS = (ACCELEROMETER, GYROSCOPE, MAGNETOMETER)
 _INERTIAL = (*_VECTORS, GRAVITY)
 _UNIT_FACTORS = {
-    (ACCELEROMETER, "g"): 9.80665,
+    (ACCELEROMETER, "g"): STANDARD_GRAVITY_M_S2,
     (GYROSCOPE, "deg/s"): math.pi / 180.0,
     (READOUT, ""): 1e-3,
     (READOUT, "ms"): 1e-3,

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodycap_batch.core.arrays import BoolArray, FloatArray
+from bodycap_batch.core.arrays import BoolArray, FloatArray, interpolated
 from bodycap_batch.model.geometry import nearest_rotation
+from bodycap_batch.model.inertial_camera import SensorRelation
 from bodycap_batch.telemetry.picture_rotation import PictureRotation
 from bodycap_batch.telemetry.streams import Stream
 
@@ -67,63 +68,45 @@ _LEAST_NOISE_RAD_S = 1e-4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GyroFit:
+class GyroFit(SensorRelation):
     """How a gyroscope relates to the pictures.
 
+    The standard deviations contain the autocorrelation of the residuals. Where the camera moves close to
+    things, the rotations of the pictures are wrong in common, and the result may be wrong by degrees.
+
     Attributes:
-        delay_s: Time of the gyroscope's samples = time of the frame + delay, seconds.
-        delay_sigma_s: Standard deviation of the delay, seconds.
-        drift: Change of the delay per second, no unit.
         middle_s: Time of a frame at which `delay_s` holds without the drift, seconds.
-        drift_sigma: Standard deviation of the drift.
-        cam_from_sensor: (3,3) rotation from the stated axes of the sensor to the camera.
-        rotation_sigma_rad: (3,) standard deviations of this rotation about the axes of the camera, radians.
-            Like the other standard deviations, they contain the autocorrelation of the residuals. Where the
-            camera moves close to things, the rotations of the pictures are wrong in common, and the result
-            may be wrong by degrees.
-        bias_rad_s: (3,) bias of the gyroscope in its axes, rad/s.
-        bias_sigma_rad_s: (3,) standard deviations of the bias, rad/s.
         focal_ratio: True focal length divided by the one that was assumed for the pictures, as a small-angle
             estimate.
-        r_squared: Share of the variance of the pictures' rotations that the gyroscope explains.
-        typical_r_squared: Median of this share over all delays that were tried: high if there is no peak.
+        typical_r_squared: Median of `r_squared` over all delays that were tried: high if there is no peak.
         gyro_shake_rad_s: Typical size of the fast changes of the gyroscope's rate, rad/s.
         picture_shake_rad_s: The same of the pictures' rotations, corrected by the focal ratio.
-        pairs: Number of pairs of frames that were used.
     """
 
-    delay_s: float
-    delay_sigma_s: float
-    drift: float
     middle_s: float
-    drift_sigma: float
-    cam_from_sensor: FloatArray
-    rotation_sigma_rad: FloatArray
-    bias_rad_s: FloatArray
-    bias_sigma_rad_s: FloatArray
     focal_ratio: float
-    r_squared: float
     typical_r_squared: float
     gyro_shake_rad_s: float
     picture_shake_rad_s: float
-    pairs: int
+
+    def in_camera(self, gyro: Stream) -> tuple[FloatArray, FloatArray]:
+        """Return times (N,) on the clock of the frames, seconds, and rates (N,3) in the camera's axes."""
+        times_s = gyro.times_s - (self.delay_s + self.drift * (gyro.times_s - self.middle_s))
+        return times_s, (gyro.values - self.bias_rad_s) @ self.cam_from_sensor.T
 
 
-class _Integral:
-    """The integral of a gyroscope's rate."""
+class RateIntegral:
+    """The integral of angular rates (N,3), rad/s, at times (N,), seconds."""
 
-    def __init__(self, gyro: Stream) -> None:
-        self.times_s = gyro.times_s
-        steps = 0.5 * (gyro.values[1:] + gyro.values[:-1]) * np.diff(gyro.times_s)[:, None]
+    def __init__(self, times_s: FloatArray, rate_rad_s: FloatArray) -> None:
+        self.times_s = times_s
+        steps = 0.5 * (rate_rad_s[1:] + rate_rad_s[:-1]) * np.diff(times_s)[:, None]
         self.total = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
     def between(self, start_s: FloatArray, end_s: FloatArray) -> FloatArray:
         """Return the integrals (N,3), radians, between pairs of times."""
-        out = np.empty((len(start_s), 3))
-        for axis in range(3):
-            column = self.total[:, axis]
-            out[:, axis] = np.interp(end_s, self.times_s, column) - np.interp(start_s, self.times_s, column)
-        return out
+        start, end = (interpolated(at_s, self.times_s, self.total) for at_s in (start_s, end_s))
+        return np.asarray(end - start)
 
 
 def fit_gyro(
@@ -144,7 +127,9 @@ def fit_gyro(
     if inside.sum() < (_MIN_POSE_PAIRS if focal_known else _MIN_PAIRS):
         return None
     picture = picture.chosen(np.flatnonzero(inside))
-    problem = _Problem(picture, _Integral(gyro), axes_known=axes_known, focal_known=focal_known)
+    problem = _Problem(
+        picture, RateIntegral(gyro.times_s, gyro.values), axes_known=axes_known, focal_known=focal_known
+    )
     delays = np.arange(-_MAX_DELAY_S, _MAX_DELAY_S + 1e-9, _DELAY_STEP_S)
     tried = [problem.first_solution(float(delay)) for delay in delays]
     shares = np.array([each.r_squared for each in tried])
@@ -185,7 +170,7 @@ class _Problem:
     """The rotations of the pictures as rates, and the gyroscope's rates for any delay."""
 
     def __init__(
-        self, picture: PictureRotation, integral: _Integral, *, axes_known: bool, focal_known: bool
+        self, picture: PictureRotation, integral: RateIntegral, *, axes_known: bool, focal_known: bool
     ) -> None:
         self._start_s, self._end_s = picture.start_s, picture.end_s
         self._interval_s = (self._end_s - self._start_s)[:, None]

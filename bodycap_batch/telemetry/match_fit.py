@@ -13,7 +13,7 @@ for delay and readout time in one problem.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -58,21 +58,6 @@ _TURN, _BIAS, _DELAY, _READOUT = slice(0, 3), slice(3, 6), 6, 7
 """Places of turn, bias, delay and readout time among the unknowns."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MatchFit:
-    """A gyroscope that is fitted to matches.
-
-    Attributes:
-        fit: The relation of the gyroscope to the camera, with better values.
-        readout_s: The readout time, seconds.
-        readout_sigma_s: Its standard deviation, seconds; 0 if it was given.
-    """
-
-    fit: GyroFit
-    readout_s: float
-    readout_sigma_s: float
-
-
 def fit_to_matches(
     rays: MatchedRays,
     times_s: FloatArray,
@@ -80,7 +65,7 @@ def fit_to_matches(
     lens: Camera,
     start: GyroFit,
     readout_s: float | None,
-) -> MatchFit | None:
+) -> tuple[GyroFit, float, float] | None:
     """Improve the relation of a gyroscope to its camera with matches, and estimate the readout time.
 
     Args:
@@ -92,7 +77,9 @@ def fit_to_matches(
         readout_s: The readout time, seconds; None to estimate it.
 
     Returns:
-        The fit; None if there are too few matches, or if the result contradicts the start.
+        The relation of the gyroscope to the camera with better values, the readout time in seconds and its
+        standard deviation, 0 if it was given. None if there are too few matches, or if the result contradicts
+        the start.
     """
     chosen = _chosen_pairs(rays, times_s, gyro, start)
     if chosen.sum() < _MIN_PAIRS:
@@ -118,8 +105,7 @@ def fit_to_matches(
         delay_sigma_s=float(sigma[_DELAY]),
     )
     readout_sigma_s = float(np.hypot(sigma[_READOUT], _READOUT_SIGMA_RATIO * x[_READOUT]))
-    readout_sigma_s = readout_sigma_s if readout_s is None else 0.0
-    return MatchFit(fit=fit, readout_s=float(x[_READOUT]), readout_sigma_s=readout_sigma_s)
+    return fit, float(x[_READOUT]), readout_sigma_s if readout_s is None else 0.0
 
 
 def _chosen_pairs(rays: MatchedRays, times_s: FloatArray, gyro: Stream, start: GyroFit) -> BoolArray:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodycap_batch.capture import CaptureCamera
-from bodycap_batch.core.arrays import FloatArray, IntArray, set_array
+from bodycap_batch.core.arrays import FloatArray, IntArray, interpolated, set_array
 from bodycap_batch.model.camera import Camera
 from bodycap_batch.model.optical_flow import (
     GreyImage,
@@ -103,8 +103,7 @@ def _windows(times_s: FloatArray, gyro: Stream) -> list[IntArray]:
     edges = np.unique(np.linspace(0, count, max(1, round(count / _WINDOW_FRAMES)) + 1).round().astype(int))
     steps = np.diff(gyro.times_s, prepend=gyro.times_s[0])[:, None]
     total = np.cumsum(gyro.values * steps, axis=0)
-    turn = np.stack([np.interp(times_s, gyro.times_s, total[:, axis]) for axis in range(3)], axis=1)
-    rates = np.diff(turn, axis=0) / np.diff(times_s)[:, None]
+    rates = np.diff(interpolated(times_s, gyro.times_s, total), axis=0) / np.diff(times_s)[:, None]
     size = np.linalg.norm(rates - np.median(rates, axis=0), axis=1) if len(rates) else np.zeros(0)
     activity = np.array([float(size[start:end].mean()) for start, end in itertools.pairwise(edges.tolist())])
     best = np.sort(np.argsort(-np.nan_to_num(activity), kind="stable")[:_MAX_WINDOWS])

@@ -21,6 +21,7 @@ import numpy as np
 from bodycap_batch.core.arrays import BoolArray, FloatArray
 from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.core.text_encoding import decode_text
+from bodycap_batch.model.gravity import STANDARD_GRAVITY_M_S2
 from bodycap_batch.telemetry.streams import (
     ACCELEROMETER,
     GYROSCOPE,
@@ -43,8 +44,6 @@ _MAX_BYTES = 512 << 20
 """Maximum size (bytes) of a file. An hour at 1,000 samples per second has 300 MB. Evidence: none."""
 _MAX_HEADER_LINES = 200
 """Maximum number of lines of a Gyroflow file before its table. Real files have some ten."""
-_STANDARD_GRAVITY = 9.80665
-"""Standard acceleration of gravity, m/s². Accelerations of Gyroflow files are in multiples of it."""
 _MAX_ABS_TIME_S = 4e9
 """Maximum absolute time, seconds: later than the Unix time of any recording."""
 _MAX_ABS_VALUE = 1e6
@@ -163,7 +162,7 @@ def _header(path: Path, lines: Sequence[str]) -> _Header:
             factors = [_TIME_UNITS_S[names[0]], 1.0, 1.0]
             if is_gyroflow:
                 factors = [_scale(path, values, name) for name in _DEFAULT_SCALES]
-                factors[2] *= _STANDARD_GRAVITY
+                factors[2] *= STANDARD_GRAVITY_M_S2  # accelerations of Gyroflow files are in multiples of g
             each = np.repeat(factors, (1, 3, 3))[: len(columns)]
             return _Header(values, index + 1, separator, columns, each, is_gyroflow)
         if (entry := _ENTRY.match(line)) is not None:

@@ -16,7 +16,7 @@ from bodycap_batch.formats.gltf.binary_buffer import (
     UINT32,
     BinaryBuffer,
 )
-from bodycap_batch.formats.mannequin import make_mannequin
+from bodycap_batch.formats.mannequin import COLOUR_RGB, make_mannequin
 from bodycap_batch.formats.y_up import Y_UP_FROM_WORLD, in_other_axes
 from bodycap_batch.model.geometry import continuous_quat_xyzw, invert, make_transform, quat_xyzw_from_rotation
 from bodycap_batch.model.measured_parts import JointSource, joint_sources
@@ -25,9 +25,6 @@ from bodycap_batch.model.take import Take
 
 _MAX_SHORT_VERTICES = 65_535
 """Number of vertices below which an index fits into 16 bits. Source: glTF 2.0 specification, 3.7.2.1."""
-
-_BODY_COLOR_RGBA = (0.62, 0.66, 0.70, 1.0)
-"""Colour of the mannequin, RGBA, 0 to 1."""
 
 
 def write_glb(
@@ -83,7 +80,7 @@ def write_glb(
             gl.Material(
                 name="Mannequin",
                 pbrMetallicRoughness=gl.PbrMetallicRoughness(
-                    baseColorFactor=list(_BODY_COLOR_RGBA), metallicFactor=0.0, roughnessFactor=0.7
+                    baseColorFactor=[*COLOUR_RGB, 1.0], metallicFactor=0.0, roughnessFactor=0.7
                 ),
             )
         ],

@@ -129,7 +129,7 @@ def _shares(options, camera, times_s, joints=None):
         for joint, shape in seen if joints is None else [seen[index] for index in joints]:
             to_part = np.linalg.inv(poses[joint]) @ cam
             cast = np.concatenate([np.tile(to_part[:3, 3], (len(rays), 1)), rays @ to_part[:3, :3].T], axis=1)
-            hit |= RayScene(shape.vertices, shape.faces).first_face(cast.astype(np.float32)) != NOTHING
+            hit |= RayScene(shape.vertices, shape.faces).first_hit(cast.astype(np.float32))[0] != NOTHING
         out.append(hit.mean())
     return np.array(out)
 
