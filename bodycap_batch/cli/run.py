@@ -32,7 +32,7 @@ from bodycap_batch.cli.terminal import print_line, print_text
 from bodycap_batch.core.errors import BodycapError, JobError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.job_places import find_job
-from bodycap_batch.tasks.order import STAGE_ORDER, StageName, stages_from
+from bodycap_batch.tasks.order import STAGE_ORDER, StageName
 
 if TYPE_CHECKING:
     from bodycap_batch.pipeline import RunSummary
@@ -85,7 +85,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
     from bodycap_batch.config.body_height import describe_height
     from bodycap_batch.config.folder import RUN_FILE, job_file_in
     from bodycap_batch.runner import Children
-    from bodycap_batch.tasks.check import CHECK
+    from bodycap_batch.tasks.stages import STAGES, stages_from
 
     if force and from_ is not None:
         raise JobError(
@@ -131,7 +131,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
         if execution.children is not None and not (loaded.out / RUN_FILE).exists():
             # With results, all stages may be stored, which needs no child. The child loads the libraries of
             # the first stage while this process imports the pipeline.
-            execution.children.start_ahead(CHECK.modules)
+            execution.children.start_ahead(STAGES["check"].modules)
         summary = execute_job(loaded, execution)
     _print_summary(summary, loaded.name, display, verbose=verbose)
     if summary.unmet is not None:

@@ -9,7 +9,6 @@ from concurrent.futures import Future, wait
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
 
 from bodycap_batch.config.calibration import Calibration
 from bodycap_batch.config.lost_frames import LEAST_LOST, LEAST_MAPPED, LEAST_POSED
@@ -33,35 +32,30 @@ from bodycap_batch.pipeline.inputs import (
 from bodycap_batch.pipeline.settings import Settings
 from bodycap_batch.pipeline.stage_results import StageResults, preview_task, report_task
 from bodycap_batch.pipeline.stage_runner import StageRunner
-from bodycap_batch.pipeline.task_keys import make_task, program_of
+from bodycap_batch.pipeline.task_keys import make_task
 from bodycap_batch.runner import NotStored, Task
 from bodycap_batch.runner.child_pool import NOTHING_TO_LOAD, Preload
 from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.tasks.body import camera_distances
-from bodycap_batch.tasks.check import CHECK, CheckTask
-from bodycap_batch.tasks.clocks import (
-    CLOCKS,
-    CameraDistance,
-    ClocksTask,
-)
-from bodycap_batch.tasks.export import EXPORT, ExportTask
-from bodycap_batch.tasks.fill import FILL, FillTask
-from bodycap_batch.tasks.further import FURTHER_MAPS, FURTHER_POSES, FurtherMapsTask, FurtherPosesTask
-from bodycap_batch.tasks.inertial import INERTIAL, InertialTask
+from bodycap_batch.tasks.check import CheckTask
+from bodycap_batch.tasks.clocks import CameraDistance, ClocksTask
+from bodycap_batch.tasks.export import ExportTask
+from bodycap_batch.tasks.fill import FillTask
+from bodycap_batch.tasks.further import FurtherMapsTask, FurtherPosesTask
+from bodycap_batch.tasks.inertial import InertialTask
 from bodycap_batch.tasks.inputs import BodyInput, CaptureRef, FileRef, stated_clocks
-from bodycap_batch.tasks.keyframes import KEYFRAMES, KeyframesTask
-from bodycap_batch.tasks.links import LINKS, LinksTask
-from bodycap_batch.tasks.mapping import EXTEND, MAP, REFINE, ExtendTask, MapTask, RefineTask
-from bodycap_batch.tasks.merge import MERGE, BoardFootage, MergeTask
-from bodycap_batch.tasks.places import PLACES, PlacesTask
-from bodycap_batch.tasks.preview import PREVIEW
-from bodycap_batch.tasks.recover import RECOVER, RecoverTask
-from bodycap_batch.tasks.registration import REGISTRATION, RegistrationTask
-from bodycap_batch.tasks.report import REPORT
-from bodycap_batch.tasks.rotations import ROTATIONS, RotationsTask, contradicted_share, without_positions
-from bodycap_batch.tasks.sound import SOUND, SoundTask, known_from_sound
-from bodycap_batch.tasks.stage import Stage, read_summary
-from bodycap_batch.tasks.undistort import UNDISTORT, UndistortTask
+from bodycap_batch.tasks.keyframes import KeyframesTask
+from bodycap_batch.tasks.links import LinksTask
+from bodycap_batch.tasks.mapping import ExtendTask, MapTask, RefineTask
+from bodycap_batch.tasks.merge import BoardFootage, MergeTask
+from bodycap_batch.tasks.places import PlacesTask
+from bodycap_batch.tasks.recover import RecoverTask
+from bodycap_batch.tasks.registration import RegistrationTask
+from bodycap_batch.tasks.rotations import RotationsTask, contradicted_share, without_positions
+from bodycap_batch.tasks.sound import SoundTask, known_from_sound
+from bodycap_batch.tasks.stage import read_summary
+from bodycap_batch.tasks.stages import STAGES
+from bodycap_batch.tasks.undistort import UndistortTask
 
 _MAX_RECOVERY_THREADS = 2
 """Maximum number of threads of the recovery of one camera. The cameras lose different numbers of frames, so
@@ -116,7 +110,7 @@ class Flow:
         except (CaptureError, JobError):
             self._settings.listener(Event(kind="failed", stage="check"))
             raise
-        preload = Preload(modules=[KEYFRAMES.modules] * (self.runner.parallel_tasks - 1))
+        preload = Preload(modules=[STAGES["keyframes"].modules] * (self.runner.parallel_tasks - 1))
         artefact = self.runner.run(task, preload)
         summary = read_summary(artefact.path)
         self.runner.expect_frames(int(summary["frames"]), int(summary.get("large_frames", 0)))
@@ -143,7 +137,6 @@ class Flow:
         capture = self._capture
         selected = self.runner.run_all(
             make_task(
-                KEYFRAMES,
                 KeyframesTask(
                     options=self._job.keyframes,
                     capture=capture_ref(capture, self._cameras, [camera]),
@@ -176,13 +169,13 @@ class Flow:
             keyframes=refs_by_camera(keyframes),
             may_be_empty=self._may_be_rotations,
         )
-        body: list[Stage[Any]] = [MERGE, FILL] if has_body(self._job) else []
-        later: list[Stage[Any]] = [REGISTRATION, CLOCKS, LINKS, *body, EXPORT, REPORT]
+        body = ["merge", "fill"] if has_body(self._job) else []
+        later = ["registration", "clocks", "links", *body, "export", "report"]
         # Features and matches keep all cores busy. After them, mapping keeps one core busy. Only then does
         # another core load the libraries of later stages. Evidence: docs/decisions/pipeline.md.
-        modules = [module for stage in later for module in stage.modules]
-        preload = self._preload([modules], [REGISTRATION, CLOCKS, *body[:1]], step=RECONSTRUCTION)
-        artefact = self.runner.run(make_task(MAP, task, threads=self._threads), preload)
+        modules = [module for name in later for module in STAGES[name].modules]
+        preload = self._preload([modules], ["registration", "clocks", *body[:1]], step=RECONSTRUCTION)
+        artefact = self.runner.run(make_task(task, threads=self._threads), preload)
         if (failure := read_summary(artefact.path)["failure"]) is not None:
             self._map_failure = EstimationError(failure["message"], hint=failure["hint"])
             if self._settings.until == "map":
@@ -193,13 +186,13 @@ class Flow:
         return artefact
 
     def _preload(
-        self, modules: Sequence[Sequence[str]], next_stages: Sequence[Stage[Any]], step: str = ""
+        self, modules: Sequence[Sequence[str]], next_stages: Sequence[str], step: str = ""
     ) -> Preload:
         """Return what an idle core does while a task runs: nothing if there is only one thread.
 
         Args:
             modules: Modules that idle children load: one list of module names for each child.
-            next_stages: Stages whose code this process reads.
+            next_stages: Names of the stages whose code this process reads.
             step: Name of the step of the task at which this begins; "" to begin with the task.
         """
         if self._threads == 1:
@@ -221,7 +214,6 @@ class Flow:
         cameras = self._capture.cameras
         return self.runner.run_all(
             make_task(
-                REGISTRATION,
                 RegistrationTask(
                     options=self._job.registration,
                     capture=self._footage([camera]),
@@ -286,7 +278,7 @@ class Flow:
             map=artefact_ref(scene_map),
             registrations=refs_by_camera(registrations),
         )
-        refined = self.runner.run(make_task(REFINE, task, threads=self._threads))
+        refined = self.runner.run(make_task(task, threads=self._threads))
         if not read_summary(refined.path)["corrected"] and not before["corrected"]:
             return refined, registrations
         self._map_round += 1
@@ -326,7 +318,7 @@ class Flow:
             clocks=refs_by_camera(clocks),
             registrations=refs_by_camera(registrations),
         )
-        artefact = self.runner.run(make_task(PLACES, task))
+        artefact = self.runner.run(make_task(task))
         self.runner.report_notes(artefact, "places")
         summary = read_summary(artefact.path)
         if not summary["places"]:
@@ -363,7 +355,7 @@ class Flow:
                 samples={name: self._samples[name] for name in names if name in self._samples},
                 stabilised=own.stabilised,
             )
-            tasks.append(make_task(INERTIAL, task, camera=own.name))
+            tasks.append(make_task(task, camera=own.name))
         used = self.runner.run_all(tasks)
         for artefact in used.values():
             self.runner.report_notes(artefact, "registration")
@@ -390,12 +382,11 @@ class Flow:
             map=artefact_ref(scene_map),
             registrations=refs_by_camera(registrations),
         )
-        further = self.runner.run(make_task(FURTHER_MAPS, task, threads=self._threads))
+        further = self.runner.run(make_task(task, threads=self._threads))
         if not read_summary(further.path)["further"]:
             return scene_map, registrations
         found = self.runner.run_all(
             make_task(
-                FURTHER_POSES,
                 FurtherPosesTask(
                     options=self._job.registration,
                     capture=self._footage([camera]),
@@ -416,7 +407,6 @@ class Flow:
         """Compare the final paths with the tracks of the videos, and return the artefact of each camera."""
         return self.runner.run_all(
             make_task(
-                LINKS,
                 LinksTask(
                     keyframes=artefact_ref(keyframes[name]),
                     map=artefact_ref(scene_map),
@@ -479,7 +469,6 @@ class Flow:
         names = without_positions({name: read_summary(each.path) for name, each in links.items()})
         measured = self.runner.run_all(
             make_task(
-                ROTATIONS,
                 RotationsTask(
                     capture=self._footage([camera]),
                     keyframes=refs_by_camera({camera.name: keyframes[camera.name]}),
@@ -521,16 +510,16 @@ class Flow:
             body=self._body,
             footage=None if self._job.merge.marker_board is None else footage,
         )
-        modules = [PREVIEW.modules] if self._job.export.preview else []
-        preload = self._preload(modules, [FILL, EXPORT, REPORT, PREVIEW])
-        artefact = self.runner.run(make_task(MERGE, task, threads=self._threads), preload)
+        modules = [STAGES["preview"].modules] if self._job.export.preview else []
+        preload = self._preload(modules, ["fill", "export", "report", "preview"])
+        artefact = self.runner.run(make_task(task, threads=self._threads), preload)
         self.runner.report_notes(artefact, "merge")
         return artefact
 
     def fill(self, merged: Artefact) -> Artefact:
         """Pose the joints that no camera measured, and return the artefact of the motion of all joints."""
         task = FillTask(mode=self._job.fill, merge=artefact_ref(merged))
-        return self.runner.run(make_task(FILL, task, threads=self._threads))
+        return self.runner.run(make_task(task, threads=self._threads))
 
     def export(self, results: StageResults) -> Artefact:
         """Write the result files and return their artefact.
@@ -555,7 +544,7 @@ class Flow:
             freed=self.freed,
             segments=tuple(tuple(camera.name for camera in cameras) for cameras in capture.segments()),
         )
-        artefact = self.runner.run(make_task(EXPORT, task, threads=self._threads))
+        artefact = self.runner.run(make_task(task, threads=self._threads))
         self.runner.report_notes(artefact, "export")
         return artefact
 
@@ -570,7 +559,6 @@ class Flow:
         assert results.map is not None
         return self.runner.run_all(
             make_task(
-                UNDISTORT,
                 UndistortTask(
                     camera=camera.name,
                     capture=self._footage([camera]),
@@ -593,7 +581,7 @@ class Flow:
             return None
         assert results.clocks is not None
         task = preview_task(self._job, results, results.map, results.clocks, self._cameras)
-        return self.runner.start(partial(self.runner.run, make_task(PREVIEW, task, threads=self._threads)))
+        return self.runner.start(partial(self.runner.run, make_task(task, threads=self._threads)))
 
     def report(self, results: StageResults, stopped_by: BodycapError | None = None) -> Artefact:
         """Write the report of all results and return its artefact.
@@ -605,7 +593,7 @@ class Flow:
         failure = results.describe_failure(stopped_by or results.failure)
         digests = self._settings.store.digests
         task = report_task(self._job, results, self._cameras, digests, failure)
-        return self.runner.run(make_task(REPORT, task))
+        return self.runner.run(make_task(task))
 
     def _decide_clocks(self, scene_map: Artefact, registrations: ByCamera, trunk: str = "") -> Artefact:
         """Decide which clock each camera has, and return the artefact of the clocks.
@@ -633,7 +621,7 @@ class Flow:
                 for first, second, least_m, most_m in distances
             ),
         )
-        return self.runner.run(make_task(CLOCKS, task))
+        return self.runner.run(make_task(task))
 
     def _footage(self, cameras: Sequence[CameraConfig] | None = None) -> CaptureRef:
         """Return the videos of all or some cameras."""
@@ -641,7 +629,7 @@ class Flow:
 
     def _start_sound(self) -> Future[Artefact]:
         """Compare the sound of the cameras, beside the keyframes if there are threads for both."""
-        compare = partial(self._compare_sound, make_task(SOUND, SoundTask(capture=self._footage())))
+        compare = partial(self._compare_sound, make_task(SoundTask(capture=self._footage())))
         if self._threads > 1:
             return self.runner.start(compare)
         done = Future[Artefact]()
@@ -718,7 +706,7 @@ class Flow:
             names=self._job.export.names,
             limits=self._settings.limits,
         )
-        return make_task(CHECK, task, threads=self._threads)
+        return make_task(task, threads=self._threads)
 
     def _extend(
         self, scene_map: Artefact, wanted: Mapping[str, Sequence[int]], keyframes: ByCamera
@@ -732,7 +720,7 @@ class Flow:
             map=artefact_ref(scene_map),
             extra={name: tuple(frames) for name, frames in wanted.items()},
         )
-        return self.runner.run(make_task(EXTEND, task, map_round=self._map_round, threads=self._threads))
+        return self.runner.run(make_task(task, map_round=self._map_round, threads=self._threads))
 
     def _recovery_tasks(
         self, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera
@@ -754,13 +742,13 @@ class Flow:
                 map=artefact_ref(scene_map),
                 registrations=refs_by_camera({name: registrations[name] for name in names}),
             )
-            yield make_task(RECOVER, task, camera=own.name, threads=min(self._threads, _MAX_RECOVERY_THREADS))
+            yield make_task(task, camera=own.name, threads=min(self._threads, _MAX_RECOVERY_THREADS))
 
 
-def _read_ahead(stages: Sequence[Stage[Any]]) -> None:
+def _read_ahead(stages: Sequence[str]) -> None:
     """Read what this process needs later: the code of stages, and a library that judges the results."""
-    for stage in stages:
-        program_of(stage).versions()
+    for name in stages:
+        STAGES[name].program.versions()
     importlib.import_module("scipy.special")
 
 

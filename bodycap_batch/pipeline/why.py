@@ -18,7 +18,8 @@ from bodycap_batch.pipeline.settings import Settings
 from bodycap_batch.pipeline.stage_results import StageResults
 from bodycap_batch.runner import NotStored, Task
 from bodycap_batch.store.artefacts import MANIFEST, Artefact, Store
-from bodycap_batch.tasks.order import BESIDE_KEYFRAMES, STAGE_ORDER
+from bodycap_batch.tasks.order import STAGE_ORDER
+from bodycap_batch.tasks.stages import STAGES
 
 _INPUTS = {
     "capture": "the video, the calibration, start_s or end_s of {}",
@@ -115,14 +116,10 @@ def _depends_on(stage: str, first: str, job: Job) -> bool:
 
 
 def _position(stage: str) -> int:
-    """Return the position of a stage in `STAGE_ORDER`.
-
-    Of the stages that are not in `STAGE_ORDER`, those beside the keyframes have the position of the
-    keyframes. The others follow the registration and have the position of the registration.
-    """
-    if stage not in STAGE_ORDER:
-        stage = "keyframes" if stage in BESIDE_KEYFRAMES else "registration"
-    return STAGE_ORDER.index(stage)
+    """Return the position in `STAGE_ORDER` of a stage, or of the stage of which it is a part."""
+    step = STAGES[stage].step
+    assert step is not None
+    return STAGE_ORDER.index(step)
 
 
 def _reason(task: Task, store: Store) -> str:

@@ -10,7 +10,7 @@ from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import BodyInput, StatedClock
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
+from bodycap_batch.tasks.stage import write_summary
 from bodycap_batch.tasks.typed_json import omitted_from_key
 
 
@@ -57,12 +57,3 @@ def run_check(task: CheckTask, context: StageContext, files: Path) -> None:
     write_summary(
         files, notes=notes, frames=frames, large_frames=large, telemetry=telemetry, stabilised=stabilised
     )
-
-
-CHECK = Stage(
-    name="check",
-    task=CheckTask,
-    function=run_check,
-    libraries=VISION_LIBRARIES,
-    modules=(*VISION_MODULES, "bodycap_batch.check", "bodycap_batch.telemetry.gopro"),
-)

@@ -10,7 +10,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, StatedClock
 from bodycap_batch.tasks.loading import CLOCKS_NAME, load_map, load_registration
 from bodycap_batch.tasks.sound import load_sound
-from bodycap_batch.tasks.stage import Stage, write_summary
+from bodycap_batch.tasks.stage import write_summary
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,12 +89,3 @@ def run_clocks(task: ClocksTask, context: StageContext, files: Path) -> None:
         distances = check_distances(load_map(task.map.path).maps[0], common_ns, reach).to_log()
     unknown = [name for name, clock in clocks.cameras.items() if not clock.is_known]
     write_summary(files, notes=clock_notes(clocks), distances=distances, unknown=unknown)
-
-
-CLOCKS = Stage(
-    name="clocks",
-    task=ClocksTask,
-    function=run_clocks,
-    libraries=("numpy", "scipy"),
-    modules=("bodycap_batch.clocks", "bodycap_batch.mapping.validation.camera_distance_check"),
-)

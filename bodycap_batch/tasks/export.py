@@ -13,7 +13,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_clocks, load_keyframes, load_map
 from bodycap_batch.tasks.registered_cameras import RegisteredCameras
-from bodycap_batch.tasks.stage import RESULTS_FOLDER, Stage, read_summary, write_summary
+from bodycap_batch.tasks.stage import RESULTS_FOLDER, read_summary, write_summary
 from bodycap_batch.tasks.typed_json import omitted_from_key
 
 if TYPE_CHECKING:
@@ -130,18 +130,3 @@ def _video_facts(capture: CaptureRef) -> dict[str, VideoFacts]:
             first_frame_ns=int(times_ns[0]),
         )
     return facts
-
-
-EXPORT = Stage(
-    name="export",
-    task=ExportTask,
-    function=run_export,
-    libraries=("numpy", "scipy", "open3d-cpu|open3d", "pygltflib", "usd-core", "ezc3d"),
-    modules=(
-        "bodycap_batch.export",
-        "bodycap_batch.formats.open3d_preload",
-        "pycolmap",
-        "pygltflib",
-        "scipy.spatial.transform",
-    ),
-)

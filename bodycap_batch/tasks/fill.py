@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.fill_data import FillMode
 from bodycap_batch.tasks.inputs import ArtefactRef
-from bodycap_batch.tasks.stage import Stage, write_summary
+from bodycap_batch.tasks.stage import write_summary
 
 if TYPE_CHECKING:
     from bodycap_batch.fill.standing_height import HeightSigmas
@@ -75,12 +75,3 @@ def _heights(merged: MergeResult) -> HeightSigmas:
     if any(source.name == "skeleton" for source in scale.sources):
         return HeightSigmas(float(np.hypot(floor_m, trunk_m)), 0.0)
     return HeightSigmas(floor_m, trunk_m)
-
-
-FILL = Stage(
-    name="fill",
-    task=FillTask,
-    function=run_fill,
-    libraries=("numpy", "scipy"),
-    modules=("bodycap_batch.fill", "scipy.signal", "scipy.spatial.transform"),
-)

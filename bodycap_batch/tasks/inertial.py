@@ -14,7 +14,6 @@ from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, FileRef
 from bodycap_batch.tasks.loading import load_registration
 from bodycap_batch.tasks.registered_cameras import INERTIAL_CAMERA
 from bodycap_batch.tasks.registration import save_registration
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
 
 if TYPE_CHECKING:
     from bodycap_batch.model.scene import Trajectory
@@ -87,12 +86,3 @@ def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None
     camera = replace(camera, nominal_fps=read_dataclass(FrameTiming, before, "timing").nominal_fps)
     save_registration(registration, camera, files, notes=notes)
     write_dataclass(found.camera, files, INERTIAL_CAMERA)
-
-
-INERTIAL = Stage(
-    name="inertial",
-    task=InertialTask,
-    function=run_inertial,
-    libraries=(*VISION_LIBRARIES, "scipy"),
-    modules=(*VISION_MODULES, "bodycap_batch.inertial", "scipy.optimize", "scipy.interpolate"),
-)

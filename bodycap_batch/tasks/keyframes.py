@@ -10,7 +10,7 @@ from bodycap_batch.config.options import KeyframeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import CaptureRef, FileRef
 from bodycap_batch.tasks.loading import TRACKS, load_capture
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
+from bodycap_batch.tasks.stage import write_summary
 
 if TYPE_CHECKING:
     from bodycap_batch.capture import CaptureCamera
@@ -188,12 +188,3 @@ def _telemetry(camera: CaptureCamera, task: KeyframesTask) -> tuple[CameraTeleme
         return read_telemetry(camera.videos, all_times_ns(camera, config), config.samples), []
     except CaptureError as error:
         return None, [f"{camera.name}: {error.one_line}; its samples are not used"]
-
-
-KEYFRAMES = Stage(
-    name="keyframes",
-    task=KeyframesTask,
-    function=run_keyframes,
-    libraries=VISION_LIBRARIES,
-    modules=(*VISION_MODULES, "bodycap_batch.keyframes", "pycolmap"),
-)

@@ -9,7 +9,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef
 from bodycap_batch.tasks.loading import TRACKS, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.registered_cameras import OTHER_PATHS
-from bodycap_batch.tasks.stage import Stage, write_summary
+from bodycap_batch.tasks.stage import write_summary
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,12 +72,3 @@ def run_links(task: LinksTask, context: StageContext, files: Path) -> None:
         compared = check_with_tracks(video, path.gauge_from_cam, show)
         links.append({"frame": path.gauge, **count_frames(compared)})
     write_summary(files, links=links, **found)
-
-
-LINKS = Stage(
-    name="links",
-    task=LinksTask,
-    function=run_links,
-    libraries=("numpy", "scipy", "opencv-python-headless|opencv-python", "pycolmap"),
-    modules=("bodycap_batch.evaluate.track_check",),
-)

@@ -13,7 +13,7 @@ from bodycap_batch.config.options import MapOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
+from bodycap_batch.tasks.stage import write_summary
 
 if TYPE_CHECKING:
     from bodycap_batch.model.scene import MapResult
@@ -149,34 +149,3 @@ def save_map(result: MapResult, files: Path) -> None:
             ),
         ],
     )
-
-
-_LIBRARIES = (*VISION_LIBRARIES, "pycolmap")
-_MODULES = (*VISION_MODULES, "pycolmap", "bodycap_batch.mapping")
-MAP_MEMORY_MB = 1500
-"""Memory to reserve (MB) for a task that builds, extends or refines a map.
-Evidence: docs/decisions/pipeline.md."""
-MAP = Stage(
-    name="map",
-    task=MapTask,
-    function=run_map,
-    libraries=_LIBRARIES,
-    modules=_MODULES,
-    memory_mb=MAP_MEMORY_MB,
-)
-EXTEND = Stage(
-    name="extend",
-    task=ExtendTask,
-    function=run_extend,
-    libraries=_LIBRARIES,
-    modules=_MODULES,
-    memory_mb=MAP_MEMORY_MB,
-)
-REFINE = Stage(
-    name="refine",
-    task=RefineTask,
-    function=run_refine,
-    libraries=_LIBRARIES,
-    modules=_MODULES,
-    memory_mb=MAP_MEMORY_MB,
-)

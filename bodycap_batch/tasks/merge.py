@@ -14,7 +14,7 @@ from bodycap_batch.tasks.body import load_body
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_clocks, load_map
 from bodycap_batch.tasks.registered_cameras import RegisteredCameras
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, Stage, write_summary
+from bodycap_batch.tasks.stage import write_summary
 
 if TYPE_CHECKING:
     from bodycap_batch.model.merge_data import MergeInputs
@@ -125,12 +125,3 @@ def _with_board(
     capture = load_capture(footage.capture, footage.keyframes, threads=context.threads)
     views = find_board_views(capture, frames, lenses, board, context)
     return dataclasses.replace(inputs, board_views=views)
-
-
-MERGE = Stage(
-    name="merge",
-    task=MergeTask,
-    function=run_merge,
-    libraries=("scipy", "gtsam", *VISION_LIBRARIES),
-    modules=("bodycap_batch.merging.stage", "gtsam", "scipy.optimize", "scipy.spatial.transform"),
-)

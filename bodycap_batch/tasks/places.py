@@ -9,7 +9,7 @@ from pathlib import Path
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef
 from bodycap_batch.tasks.loading import load_clocks, load_registration
-from bodycap_batch.tasks.stage import Stage, write_summary
+from bodycap_batch.tasks.stage import write_summary
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,12 +47,3 @@ def run_places(task: PlacesTask, context: StageContext, files: Path) -> None:
     text = ", ".join(f"{name} on {place}" for name, place in found.by_camera.items())
     notes = [f"places found from the motion: {text}"] if text else []
     write_summary(files, places=dict(found.by_camera), reason=found.reason, notes=notes)
-
-
-PLACES = Stage(
-    name="places",
-    task=PlacesTask,
-    function=run_places,
-    libraries=("numpy", "scipy"),
-    modules=("bodycap_batch.camera_places",),
-)

@@ -11,7 +11,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_clocks, load_map, load_registration
 from bodycap_batch.tasks.registered_cameras import RegisteredCameras
-from bodycap_batch.tasks.stage import RESULTS_FOLDER, VISION_LIBRARIES, VISION_MODULES, Stage
+from bodycap_batch.tasks.stage import RESULTS_FOLDER
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -112,17 +112,3 @@ def _trunk_first(capture: Capture, merge: MergeResult | None) -> Capture:
     limb = {mount.camera: split_side(mount.role)[0] != "" for mount in merge.mounts}
     order = sorted(capture.cameras, key=lambda camera: (camera.name not in limb, limb.get(camera.name)))
     return replace(capture, cameras=tuple(order))
-
-
-PREVIEW = Stage(
-    name="preview",
-    task=PreviewTask,
-    function=run_preview,
-    libraries=(*VISION_LIBRARIES, "scipy", "pycolmap"),
-    modules=(
-        *VISION_MODULES,
-        "bodycap_batch.preview",
-        "pycolmap",
-        "scipy.spatial.transform",
-    ),
-)

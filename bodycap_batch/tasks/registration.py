@@ -12,7 +12,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.registered_cameras import registration_summary
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
+from bodycap_batch.tasks.stage import write_summary
 from bodycap_batch.tasks.typed_json import omitted_from_key
 
 if TYPE_CHECKING:
@@ -81,12 +81,3 @@ def save_registration(
     write_dataclass(timing, files, "timing")
     write_dataclass(camera.camera, files, "camera")
     write_summary(files, **registration_summary(found), notes=list(notes))
-
-
-REGISTRATION = Stage(
-    name="registration",
-    task=RegistrationTask,
-    function=run_registration,
-    libraries=(*VISION_LIBRARIES, "pycolmap"),
-    modules=(*VISION_MODULES, "pycolmap", "bodycap_batch.registration"),
-)

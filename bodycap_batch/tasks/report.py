@@ -12,7 +12,7 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.body import load_body
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_clocks, load_keyframes, load_map, load_registration
-from bodycap_batch.tasks.stage import RESULTS_FOLDER, VISION_LIBRARIES, VISION_MODULES, Stage
+from bodycap_batch.tasks.stage import RESULTS_FOLDER
 
 if TYPE_CHECKING:
     from bodycap_batch.capture import Capture
@@ -136,12 +136,3 @@ def _open_capture(task: ReportTask, clocks: CaptureClocks, threads: int) -> Capt
         if task.failure is None:
             raise
         return None
-
-
-REPORT = Stage(
-    name="report",
-    task=ReportTask,
-    function=run_report,
-    libraries=(*VISION_LIBRARIES, "jinja2", "k3d", "pycolmap", "scipy"),
-    modules=(*VISION_MODULES, "bodycap_batch.report", "jinja2", "pycolmap", "scipy.spatial.transform"),
-)

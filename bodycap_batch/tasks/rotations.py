@@ -12,7 +12,6 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.registered_cameras import replace_registration
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
 
 if TYPE_CHECKING:
     from bodycap_batch.model.camera import Camera
@@ -121,12 +120,3 @@ def lens_for_rotations(start: Camera, selection: KeyframeSelection) -> tuple[Cam
     return (
         (start, _START_SIGMA) if selection.lens is None else (selection.lens.lens, selection.lens.focal_sigma)
     )
-
-
-ROTATIONS = Stage(
-    name="rotations",
-    task=RotationsTask,
-    function=run_rotations,
-    libraries=(*VISION_LIBRARIES, "pycolmap", "scipy"),
-    modules=(*VISION_MODULES, "pycolmap"),
-)

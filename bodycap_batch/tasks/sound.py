@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from bodycap_batch.config.models import CaptureConfig
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import CaptureRef
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
+from bodycap_batch.tasks.stage import write_summary
 
 if TYPE_CHECKING:
     from bodycap_batch.clocks import SoundEvidence
@@ -63,8 +63,3 @@ def known_from_sound(capture: CaptureConfig, artefact: Path | None) -> CaptureCo
 
     clocks = decide_clocks(capture, combine_evidence(capture, load_sound(artefact)))
     return with_known_offsets(capture, clocks)
-
-
-SOUND = Stage(
-    name="sound", task=SoundTask, function=run_sound, libraries=VISION_LIBRARIES, modules=VISION_MODULES
-)

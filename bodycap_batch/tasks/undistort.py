@@ -9,7 +9,7 @@ from pathlib import Path
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_map
-from bodycap_batch.tasks.stage import RESULTS_FOLDER, VISION_LIBRARIES, VISION_MODULES, Stage
+from bodycap_batch.tasks.stage import RESULTS_FOLDER
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,12 +61,3 @@ def run_undistort(task: UndistortTask, context: StageContext, files: Path) -> No
         timecode=facts.get("start_timecode", ""),
     )
     write_undistorted_clip(clip, context)
-
-
-UNDISTORT = Stage(
-    name="undistort",
-    task=UndistortTask,
-    function=run_undistort,
-    libraries=(*VISION_LIBRARIES, "pycolmap"),
-    modules=(*VISION_MODULES, "bodycap_batch.preview", "pycolmap"),
-)

@@ -96,7 +96,7 @@ def test_modules_of_later_stages_load_while_a_core_is_idle(bench: Bench, threads
 def test_the_code_of_later_stages_is_read_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[str] = []
     monkeypatch.setattr(Program, "versions", lambda program: read.append(program.module))
-    _read_ahead([STAGES["merge"], STAGES["export"]])
+    _read_ahead(["merge", "export"])
     assert read == ["tasks.merge", "tasks.export"]
     assert "scipy.special" in sys.modules
 

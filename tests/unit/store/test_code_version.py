@@ -34,7 +34,7 @@ def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def versions() -> dict[str, str]:
     forget()
-    return {name: code_version.algorithm_version(stage.module) for name, stage in STAGES.items()}
+    return {name: code_version.algorithm_version(stage.program.module) for name, stage in STAGES.items()}
 
 
 def changed_by(path: Path, text: str = "\nANOTHER = 1\n") -> set[str]:
@@ -58,7 +58,7 @@ def imported_modules(path: Path) -> Iterator[str]:
 
 def test_the_same_sources_have_the_same_version(copied: Path) -> None:
     assert versions() == versions()
-    assert len(set(versions().values())) == len({stage.module for stage in STAGES.values()})
+    assert len(set(versions().values())) == len({stage.program.module for stage in STAGES.values()})
 
 
 READ_BY_ALL = {"config", "core", "formats", "model", "tasks"}
@@ -100,7 +100,7 @@ motion, so it does not depend on the export. Of the presets, opening a camera re
 
 @pytest.mark.parametrize("stage", sorted(STAGES))
 def test_the_code_of_a_stage_is_that_of_these_packages(copied: Path, stage: str) -> None:
-    found = code_version._closure(STAGES[stage].module)
+    found = code_version._closure(STAGES[stage].program.module)
     packages = {path.relative_to(copied).parts[0].removesuffix(".py") for path in found}
     assert packages == HASHED[stage]
 
@@ -117,7 +117,7 @@ def test_every_import_is_found() -> None:
     ("stage", "package"), [("map", "mapping"), ("registration", "registration"), ("merge", "merging")]
 )
 def test_all_files_of_an_estimator_count(copied: Path, stage: str, package: str) -> None:
-    found = code_version._closure(STAGES[stage].module)
+    found = code_version._closure(STAGES[stage].program.module)
     assert set((copied / package).rglob("*.py")) <= found
 
 
