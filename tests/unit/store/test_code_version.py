@@ -65,10 +65,10 @@ READ_BY_ALL = {"config", "core", "formats", "model", "tasks"}
 CAMERAS = READ_BY_ALL | {"capture", "presets"}
 BODY = CAMERAS
 HASHED = {
-    "synth": BODY | {"synthetic"},
+    "synth": READ_BY_ALL | {"presets", "synthetic"},
     "check": BODY | {"check", "store", "telemetry"},
     "inertial": CAMERAS | {"inertial", "registration", "telemetry"},
-    "sound": CAMERAS | {"clocks", "telemetry"},
+    "sound": READ_BY_ALL | {"capture", "clocks", "telemetry"},
     # The clocks stage compares the distances between the cameras with the reach of the body.
     "clocks": CAMERAS | {"clocks", "mapping", "telemetry"},
     "keyframes": CAMERAS | {"keyframes", "telemetry", "tracks"},
@@ -82,7 +82,7 @@ HASHED = {
     "rotations": CAMERAS | {"tracks"},
     # Merging reads marker boards from the images, and explains a failure by mirrored cameras.
     "merge": BODY | {"merging", "calibration", "mapping"},
-    "fill": BODY | {"fill"},
+    "fill": {"core", "formats", "model", "presets", "tasks", "fill"},
     # The places of unnamed cameras follow from their paths alone.
     "places": CAMERAS | {"camera_places"},
     # The files state the timecode of the videos.
@@ -93,8 +93,7 @@ HASHED = {
 }
 """Packages whose files are part of a stage's version.
 
-They are those of version 0.1.0 at their new places. The preview alone lost one: it no longer projects the
-motion, so it does not depend on the export. Of the presets, opening a camera reads the table of lenses alone.
+Of the presets, opening a camera reads the table of lenses alone.
 """
 
 
