@@ -12,6 +12,7 @@ from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_clocks, load_keyframes, load_map
+from bodycap_batch.tasks.motion import load_motion
 from bodycap_batch.tasks.registered_cameras import RegisteredCameras
 from bodycap_batch.tasks.stage import RESULTS_FOLDER, read_summary, write_summary
 from bodycap_batch.tasks.typed_json import omitted_from_key
@@ -58,14 +59,12 @@ class ExportTask:
 def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
     """Write the result files; the notes in the summary say which parts are empty and left out."""
     from bodycap_batch.export import LEFT_OUT, ExportInputs, export_results
-    from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.model.merge_data import MergeResult
 
     scene = load_map(task.map.path)
     paths = paths_of(task.registrations.values())
-    clocks = load_clocks(task.clocks)
+    clocks = load_clocks(task.clocks.path)
     found = RegisteredCameras.load(paths, scene.maps, clocks)
-    merge = None if task.merge is None else read_dataclass(MergeResult, task.merge.path, "merge")
+    merge = None if task.merge is None else load_motion(task.merge)
     inputs = ExportInputs(
         out_dir=files / RESULTS_FOLDER,
         maps=scene.maps,

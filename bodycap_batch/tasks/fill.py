@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.model.fill_data import FillMode
 from bodycap_batch.tasks.inputs import ArtefactRef
+from bodycap_batch.tasks.motion import MOTION_NAME, load_motion
 from bodycap_batch.tasks.stage import write_summary
 
 if TYPE_CHECKING:
@@ -41,10 +42,9 @@ class FillTask:
 def run_fill(task: FillTask, context: StageContext, files: Path) -> None:
     """Pose the joints and store the motion."""
     from bodycap_batch.fill import fill_motion
-    from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
-    from bodycap_batch.model.merge_data import MergeResult
+    from bodycap_batch.formats.dataclass_files import write_dataclass
 
-    merged = read_dataclass(MergeResult, task.merge.path, "merge")
+    merged = load_motion(task.merge)
     filled = fill_motion(
         merged.motion,
         merged.solved,
@@ -52,7 +52,7 @@ def run_fill(task: FillTask, context: StageContext, files: Path) -> None:
         mode=task.mode,
         context=context,
     )
-    write_dataclass(replace(merged, motion=filled.motion, fill=filled.report), files, "merge")
+    write_dataclass(replace(merged, motion=filled.motion, fill=filled.report), files, MOTION_NAME)
     write_summary(files, filled=int(filled.report.filled.sum()))
 
 

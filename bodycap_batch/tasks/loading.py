@@ -87,12 +87,12 @@ def load_map(path: Path) -> MapResult:
     return read_dataclass(MapResult, path, "map")
 
 
-def load_clocks(artefact: ArtefactRef) -> CaptureClocks:
-    """Read the clocks of all cameras from an artefact."""
+def load_clocks(path: Path) -> CaptureClocks:
+    """Read the clocks of all cameras from an artefact's folder."""
     from bodycap_batch.formats.dataclass_files import read_dataclass
     from bodycap_batch.model.camera_clock import CaptureClocks
 
-    return read_dataclass(CaptureClocks, artefact.path, CLOCKS_NAME)
+    return read_dataclass(CaptureClocks, path, CLOCKS_NAME)
 
 
 def load_registration(path: Path) -> Registration:

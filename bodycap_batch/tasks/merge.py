@@ -13,6 +13,7 @@ from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.tasks.body import load_body
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_clocks, load_map
+from bodycap_batch.tasks.motion import MOTION_NAME
 from bodycap_batch.tasks.registered_cameras import RegisteredCameras
 from bodycap_batch.tasks.stage import write_summary
 
@@ -69,7 +70,7 @@ def run_merge(task: MergeTask, context: StageContext, files: Path) -> None:
 
         add_flip_hint(error, load_map(task.map.path).diagnostics)
         raise
-    write_dataclass(result, files, "merge")
+    write_dataclass(result, files, MOTION_NAME)
     notes = [f"camera {name} is not used for the body: {why}" for name, why in result.unused_cameras.items()]
     notes += [result.report.exchanged_sides.says] if result.report.exchanged_sides is not None else []
     notes += [result.report.inverted_cameras.says] if result.report.inverted_cameras is not None else []
@@ -82,7 +83,7 @@ def _merge_inputs(task: MergeTask) -> MergeInputs:
 
     scene = load_map(task.map.path)
     found = RegisteredCameras.load(
-        paths_of(task.registrations.values()), scene.maps, load_clocks(task.clocks)
+        paths_of(task.registrations.values()), scene.maps, load_clocks(task.clocks.path)
     )
     skeleton, mounts = load_body(task.body)
     mounted = {mount.camera for mount in mounts}

@@ -42,7 +42,7 @@ def run_places(task: PlacesTask, context: StageContext, files: Path) -> None:
     if len({path.gauge for path in paths}) > 1:
         found = FoundPlaces(by_camera={}, reason="the cameras are not in one map")
     else:
-        clocks = {trunk: load_clocks(artefact).cameras for trunk, artefact in task.clocks.items()}
+        clocks = {trunk: load_clocks(artefact.path).cameras for trunk, artefact in task.clocks.items()}
         found = find_places_with(clocks, paths, task.stated)
     text = ", ".join(f"{name} on {place}" for name, place in found.by_camera.items())
     notes = [f"places found from the motion: {text}"] if text else []

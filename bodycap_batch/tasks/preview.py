@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_clocks, load_map, load_registration
+from bodycap_batch.tasks.motion import load_motion
 from bodycap_batch.tasks.registered_cameras import RegisteredCameras
 from bodycap_batch.tasks.stage import RESULTS_FOLDER
 
@@ -56,17 +57,15 @@ def run_preview(task: PreviewTask, context: StageContext, files: Path) -> None:
 def _preview_inputs(task: PreviewTask, path: Path, threads: int) -> PreviewInputs:
     import numpy as np
 
-    from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.model.merge_data import MergeResult
     from bodycap_batch.overlay import bones_from_motion, make_camera_views
     from bodycap_batch.preview import PreviewInputs
 
     scene = load_map(task.map.path)
     paths = paths_of(task.registrations.values())
-    clocks = load_clocks(task.clocks)
+    clocks = load_clocks(task.clocks.path)
     capture = load_capture(task.capture, task.keyframes, clocks=clocks, threads=threads)
     found = RegisteredCameras.load(paths, scene.maps, clocks)
-    merge = None if task.merge is None else read_dataclass(MergeResult, task.merge.path, "merge")
+    merge = None if task.merge is None else load_motion(task.merge)
     registrations = [load_registration(artefact) for artefact in paths]
     transforms = _transforms_of(scene.maps, merge)
     points = [transforms[item.gauge].apply(item.points) for item in scene.maps if item.gauge in transforms]

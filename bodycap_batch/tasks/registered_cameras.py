@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -33,16 +34,12 @@ def replace_registration(found: Registration, before: Path, files: Path, **summa
         files: Folder of the artefact.
         summary: Further values of the summary.
     """
-    from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
-    from bodycap_batch.model.camera import Camera
-    from bodycap_batch.model.camera_clock import FrameTiming
-    from bodycap_batch.model.inertial_camera import InertialCamera
+    from bodycap_batch.formats.dataclass_files import write_dataclass
 
     write_dataclass(found, files, "registration")
-    kinds = {"timing": FrameTiming, "camera": Camera, INERTIAL_CAMERA: InertialCamera}
-    for name, kind in kinds.items():
-        if (before / f"{name}.json").exists():
-            write_dataclass(read_dataclass(kind, before, name), files, name)
+    for name in ("timing", "camera", INERTIAL_CAMERA):
+        for file in before.glob(f"{name}.*"):
+            shutil.copyfile(file, files / file.name)
     write_summary(files, **registration_summary(found), **summary)
 
 

@@ -12,12 +12,12 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.body import load_body
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_clocks, load_keyframes, load_map, load_registration
+from bodycap_batch.tasks.motion import load_motion
 from bodycap_batch.tasks.stage import RESULTS_FOLDER
 
 if TYPE_CHECKING:
     from bodycap_batch.capture import Capture
     from bodycap_batch.model.camera_clock import CaptureClocks
-    from bodycap_batch.model.merge_data import MergeResult
     from bodycap_batch.report import ReportInputs
 
 
@@ -82,7 +82,7 @@ def load_inputs(task: ReportTask, threads: int = 0) -> ReportInputs:
         found.trajectory.camera: read_dataclass(FrameTiming, path, "timing")
         for path, found in zip(paths, registrations, strict=True)
     }
-    clocks = CaptureClocks(reference="") if task.clocks is None else load_clocks(task.clocks)
+    clocks = CaptureClocks(reference="") if task.clocks is None else load_clocks(task.clocks.path)
     maps = () if task.map is None else load_map(task.map.path).maps
     return ReportInputs(
         name=task.name,
@@ -92,7 +92,7 @@ def load_inputs(task: ReportTask, threads: int = 0) -> ReportInputs:
         clocks=clocks.with_timing(timings),
         reference_camera=clocks.reference,
         selections=tuple(load_keyframes(artefact.path) for artefact in task.keyframes.values()),
-        merge=_load_merge(task.merge),
+        merge=None if task.merge is None else load_motion(task.merge),
         mounts=() if task.body is None else load_body(task.body)[1],
         metrics=None
         if task.export is None
@@ -109,13 +109,6 @@ def _result_files(export: ArtefactRef) -> tuple[str, ...]:
     """Return the paths of the result files of the export, relative to the results folder."""
     folder = export.path / RESULTS_FOLDER
     return tuple(sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()))
-
-
-def _load_merge(merge: ArtefactRef | None) -> MergeResult | None:
-    from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.model.merge_data import MergeResult
-
-    return None if merge is None else read_dataclass(MergeResult, merge.path, "merge")
 
 
 def _open_capture(task: ReportTask, clocks: CaptureClocks, threads: int) -> Capture | None:
