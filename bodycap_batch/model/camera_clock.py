@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -130,11 +130,7 @@ class CaptureClocks:
 
     def with_timing(self, timings: Mapping[str, FrameTiming]) -> dict[str, CameraClock]:
         """Return the clocks of the cameras with a known frame timing, by camera name."""
-        clocks = {}
-        for name, timing in timings.items():
-            relation = self.cameras.get(name, ClockRelation())
-            parts = {each.name: getattr(relation, each.name) for each in fields(ClockRelation)}
-            clocks[name] = CameraClock(
-                nominal_fps=timing.nominal_fps, rolling_shutter_s=timing.rolling_shutter_s, **parts
-            )
-        return clocks
+        return {
+            name: CameraClock(**asdict(timing), **asdict(self.cameras.get(name, ClockRelation())))
+            for name, timing in timings.items()
+        }
