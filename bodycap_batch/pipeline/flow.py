@@ -112,8 +112,9 @@ def check(runner: StageRunner, results: StageResults) -> None:
         results.facts = _with_known_clocks(settings, facts, results.sound)
 
 
-def select_keyframes(runner: StageRunner, facts: JobFacts) -> ByCamera:
+def select_keyframes(runner: StageRunner, results: StageResults) -> ByCamera:
     """Select the keyframes of every camera. Damaged and frozen frames are reported to the user."""
+    facts = results.facts
 
     def task(camera: CameraConfig) -> KeyframesTask:
         with_gyro = facts.job.telemetry.tracking and camera.name in facts.telemetry
@@ -130,7 +131,7 @@ def select_keyframes(runner: StageRunner, facts: JobFacts) -> ByCamera:
     return selected
 
 
-def build_map(runner: StageRunner, facts: JobFacts, keyframes: ByCamera) -> Artefact:
+def build_map(runner: StageRunner, results: StageResults) -> Artefact:
     """Build the map of all keyframes.
 
     Without a body, the map may be empty (see `map_failure`): `measure_rotations` then has the last word.
@@ -138,10 +139,11 @@ def build_map(runner: StageRunner, facts: JobFacts, keyframes: ByCamera) -> Arte
     Raises:
         EstimationError: There is no map.
     """
+    facts = results.facts
     task = MapTask(
         options=facts.job.map,
         capture=facts.footage(),
-        keyframes=refs_by_camera(keyframes),
+        keyframes=refs_by_camera(results.keyframes),
         may_be_empty=_may_be_rotations(facts),
     )
     body = ["merge", "fill"] if has_body(facts.job) else []
@@ -162,113 +164,93 @@ def map_failure(scene_map: Artefact) -> EstimationError | None:
     return None if failure is None else EstimationError(failure["message"], hint=failure["hint"])
 
 
-def register(
-    runner: StageRunner,
-    facts: JobFacts,
-    scene_map: Artefact,
-    keyframes: ByCamera,
-    previous: ByCamera | None = None,
-    map_round: int = 0,
-) -> ByCamera:
-    """Register every frame of every camera against the map.
-
-    Args:
-        runner: Runs the tasks.
-        facts: The job.
-        scene_map: The map.
-        keyframes: The keyframes of each camera.
-        previous: The registrations against an earlier round of the map, whose tracks are reused. None in the
-            first round.
-        map_round: Round of the map, counted from 0.
-    """
+def register(runner: StageRunner, results: StageResults) -> ByCamera:
+    """Register every frame of every camera against the map, with the tracks of earlier registrations."""
+    facts, scene_map = results.facts, artefact_ref(results.scene_map)
 
     def task(camera: CameraConfig) -> RegistrationTask:
         return RegistrationTask(
             options=facts.job.registration,
             capture=facts.footage([camera]),
-            keyframes=refs_by_camera({camera.name: keyframes[camera.name]}),
-            map=artefact_ref(scene_map),
-            previous=optional_ref(None if previous is None else previous[camera.name]),
+            keyframes=refs_by_camera({camera.name: results.keyframes[camera.name]}),
+            map=scene_map,
+            previous=optional_ref(results.registrations.get(camera.name)),
         )
 
-    return _run_per_camera(runner, facts, task, map_round=map_round)
+    return _run_per_camera(runner, facts, task, map_round=results.map_round)
 
 
-def grow_map(
-    runner: StageRunner, facts: JobFacts, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera
-) -> tuple[Artefact, ByCamera, int]:
+def grow_map(runner: StageRunner, results: StageResults) -> StageResults:
     """Add keyframes at times of lost frames and register again, until no further frame is localised.
 
     Returns:
-        The grown map, the registrations against this map, and the number of rounds. A round that fails, or
-        that loses frames, is not used. Frames whose pose a round withdraws, because they contradict the map,
-        were wrong before and do not count as lost.
+        The results with the grown map and the registrations against this map. A round that fails, or that
+        loses frames, is not used. Frames whose pose a round withdraws, because they contradict the map, were
+        wrong before and do not count as lost.
     """
-    map_round = 0
+    facts = results.facts
     for _ in range(facts.job.registration.rounds if is_on(Mechanism.EXTENSION) else 0):
-        summaries = {name: read_summary(artefact.path) for name, artefact in registrations.items()}
+        summaries = {name: read_summary(artefact.path) for name, artefact in results.registrations.items()}
         wanted = {name: summary["wanted"] for name, summary in summaries.items() if summary["wanted"]}
         if not wanted:
             break
-        map_round += 1
+        results = replace(results, map_round=results.map_round + 1)
         task = ExtendTask(
             options=facts.job.map,
             capture=facts.footage(),
-            keyframes=refs_by_camera(keyframes),
-            map=artefact_ref(scene_map),
+            keyframes=refs_by_camera(results.keyframes),
+            map=artefact_ref(results.scene_map),
             extra={name: tuple(frames) for name, frames in wanted.items()},
         )
         try:
-            extended = runner.run(make_task(task, map_round=map_round, threads=runner.settings.threads))
+            extended = runner.run(
+                make_task(task, map_round=results.map_round, threads=runner.settings.threads)
+            )
         except EstimationError as error:
             cause = "the map could not be extended to localise lost frames"
             runner.note(f"{cause}, so the earlier map is kept: {error.message}", "extend")
             break
-        again = register(runner, facts, extended, keyframes, registrations, map_round)
-        gained = _posed_frames(again) - _posed_frames(registrations)
+        grown = replace(results, map=extended)
+        grown.registrations = register(runner, grown)
+        gained = _posed_frames(grown.registrations) - _posed_frames(results.registrations)
         if gained < 0:
             break
         # The new map is used even if no further frame is localised: misregistered keyframes have new poses in
         # the new map.
-        scene_map, registrations = extended, again
+        results = grown
         if gained == 0:
             break
-    return scene_map, registrations, map_round
+    return results
 
 
-def refine_map(
-    runner: StageRunner,
-    facts: JobFacts,
-    scene_map: Artefact,
-    registrations: ByCamera,
-    keyframes: ByCamera,
-    map_round: int,
-) -> tuple[Artefact, ByCamera]:
+def refine_map(runner: StageRunner, results: StageResults) -> StageResults:
     """Remove the deformation of the map that rolling shutters cause, and solve all poses again.
 
-    If no camera has a rolling shutter, the map and the registrations are returned unchanged. If readout times
-    are unknown, and the keyframes show no rolling shutter, the registrations are unchanged. `map_round` is
-    the round of the refined map.
+    Returns:
+        The results with the refined map and the registrations against it. If no camera has a rolling shutter,
+        both are unchanged. If readout times are unknown, and the keyframes show no rolling shutter, the
+        registrations are unchanged.
     """
-    before = read_summary(scene_map.path)
+    before = read_summary(results.scene_map.path)
     if not before["rolling"] or not is_on(Mechanism.REFINEMENT):
-        return scene_map, registrations
+        return results
     task = RefineTask(
-        options=facts.job.map,
-        capture=facts.footage(),
-        map=artefact_ref(scene_map),
-        registrations=refs_by_camera(registrations),
+        options=results.facts.job.map,
+        capture=results.facts.footage(),
+        map=artefact_ref(results.scene_map),
+        registrations=refs_by_camera(results.registrations),
     )
-    refined = runner.run(make_task(task, threads=runner.settings.threads))
-    if not read_summary(refined.path)["corrected"] and not before["corrected"]:
-        return refined, registrations
-    return refined, register(runner, facts, refined, keyframes, registrations, map_round)
+    refined = replace(results, map=runner.run(make_task(task, threads=runner.settings.threads)))
+    if read_summary(refined.scene_map.path)["corrected"] or before["corrected"]:
+        refined.map_round += 1
+        refined.registrations = register(runner, refined)
+    return refined
 
 
-def recover(
-    runner: StageRunner, facts: JobFacts, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera
-) -> ByCamera:
+def recover(runner: StageRunner, results: StageResults) -> ByCamera:
     """Recover the lost frames of each camera that has enough lost frames and enough localised frames."""
+    facts, keyframes, registrations = results.facts, results.keyframes, results.registrations
+    scene_map = artefact_ref(results.scene_map)
 
     def tasks() -> Iterator[Task]:
         for own in facts.capture.cameras if is_on(Mechanism.RECOVERY) else ():
@@ -282,7 +264,7 @@ def recover(
                 cameras=tuple(names),
                 capture=facts.footage(ordered),
                 keyframes=refs_by_camera({name: keyframes[name] for name in names}),
-                map=artefact_ref(scene_map),
+                map=scene_map,
                 registrations=refs_by_camera({name: registrations[name] for name in names}),
             )
             threads = min(runner.settings.threads, _MAX_RECOVERY_THREADS)
@@ -291,24 +273,15 @@ def recover(
     return {**registrations, **runner.run_all(tasks())}
 
 
-def decide_clocks(
-    runner: StageRunner,
-    facts: JobFacts,
-    scene_map: Artefact,
-    registrations: ByCamera,
-    sound: Future[Artefact] | None,
-    trunk: str = "",
-) -> Artefact:
+def decide_clocks(runner: StageRunner, results: StageResults, trunk: str = "") -> Artefact:
     """Decide which clock each camera has.
 
     Args:
         runner: Runs the task.
-        facts: The job.
-        scene_map: The map.
-        registrations: The registration of each camera.
-        sound: The comparison of the sound; None if there is only one camera.
+        results: The results up to the paths of the cameras.
         trunk: Name of the camera that is taken for the one on the trunk; "" for the places of the job.
     """
+    facts, sound = results.facts, results.sound
     capture, body = facts.job.capture, _body_of(runner.settings, facts)
     stated = stated_clocks(capture)
     if trunk:
@@ -319,8 +292,8 @@ def decide_clocks(
         common=capture.clocks,
         rig=capture.rig,
         sound=optional_ref(None if sound is None else sound.result()),
-        map=artefact_ref(scene_map),
-        registrations=refs_by_camera(registrations),
+        map=artefact_ref(results.scene_map),
+        registrations=refs_by_camera(results.registrations),
         reach=tuple(
             CameraDistance(first=first, second=second, least_m=least_m, most_m=most_m)
             for first, second, least_m, most_m in ([] if body is None else camera_distances(body))
@@ -329,13 +302,7 @@ def decide_clocks(
     return runner.run(make_task(task))
 
 
-def find_places(
-    runner: StageRunner,
-    facts: JobFacts,
-    scene_map: Artefact,
-    registrations: ByCamera,
-    sound: Future[Artefact] | None,
-) -> JobFacts:
+def find_places(runner: StageRunner, results: StageResults) -> JobFacts:
     """Find the places of the cameras whose place is unknown, and return the facts with all places.
 
     If every place is known, or the job asks for no skeleton, the facts are returned unchanged.
@@ -343,20 +310,18 @@ def find_places(
     Raises:
         EstimationError: The motion does not show which camera was where.
     """
+    facts = results.facts
     unplaced = facts.job.capture.unplaced()
     if not unplaced or not has_body(facts.job):
         return facts
-    clocks = {"": decide_clocks(runner, facts, scene_map, registrations, sound)}
+    clocks = {"": decide_clocks(runner, results)}
     if read_summary(clocks[""].path)["unknown"]:
-        clocks = {
-            camera.name: decide_clocks(runner, facts, scene_map, registrations, sound, trunk=camera.name)
-            for camera in unplaced
-        }
+        clocks = {camera.name: decide_clocks(runner, results, trunk=camera.name) for camera in unplaced}
     stated = [(camera.name, mount_of(camera.mount or camera.name)) for camera in facts.capture.cameras]
     task = PlacesTask(
         stated={name: found[0] for name, found in stated if found is not None},
         clocks=refs_by_camera(clocks),
-        registrations=refs_by_camera(registrations),
+        registrations=refs_by_camera(results.registrations),
     )
     artefact = runner.run(make_task(task))
     runner.report_notes(artefact, "places")
@@ -366,12 +331,13 @@ def find_places(
     return facts.with_places(summary["places"])
 
 
-def use_sensors(runner: StageRunner, facts: JobFacts, registrations: ByCamera) -> ByCamera:
+def use_sensors(runner: StageRunner, results: StageResults) -> ByCamera:
     """Use the inertial sensors of the cameras that have telemetry, and report notes to the user.
 
     Without telemetry, or if all uses are switched off, the registrations are returned unchanged. The
     telemetry of cameras that stabilised their pictures is always read: it shows how they are turned.
     """
+    facts, registrations = results.facts, results.registrations
     off = {
         field: False
         for field, mechanism in (("gaps", Mechanism.GAP_FILLING), ("smoothing", Mechanism.SENSOR_PATH))
@@ -400,15 +366,14 @@ def use_sensors(runner: StageRunner, facts: JobFacts, registrations: ByCamera) -
     return {**registrations, **used}
 
 
-def map_lost_parts(
-    runner: StageRunner, facts: JobFacts, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera
-) -> tuple[Artefact, ByCamera]:
+def map_lost_parts(runner: StageRunner, results: StageResults) -> tuple[Artefact, ByCamera]:
     """Map the parts of the videos that no path contains, and localise their frames in these maps.
 
     Returns:
         All maps, and the registrations, which name these frames and hold their poses. Both are unchanged if
         there are no further maps.
     """
+    facts, scene_map, registrations = results.facts, results.scene_map, results.registrations
     summaries = [read_summary(artefact.path) for artefact in registrations.values()]
     lost = sum(summary["frames"] - summary["localised"] for summary in summaries)
     if lost < LEAST_MAPPED or map_failure(scene_map) is not None or not is_on(Mechanism.FURTHER_MAPS):
@@ -416,7 +381,7 @@ def map_lost_parts(
     task = FurtherMapsTask(
         options=facts.job.map,
         capture=facts.footage(),
-        keyframes=refs_by_camera(keyframes),
+        keyframes=refs_by_camera(results.keyframes),
         map=artefact_ref(scene_map),
         registrations=refs_by_camera(registrations),
     )
@@ -428,7 +393,7 @@ def map_lost_parts(
         return FurtherPosesTask(
             options=facts.job.registration,
             capture=facts.footage([camera]),
-            keyframes=refs_by_camera({camera.name: keyframes[camera.name]}),
+            keyframes=refs_by_camera({camera.name: results.keyframes[camera.name]}),
             map=artefact_ref(further),
             registration=artefact_ref(registrations[camera.name]),
         )
@@ -436,14 +401,12 @@ def map_lost_parts(
     return further, _run_per_camera(runner, facts, poses)
 
 
-def compare_with_tracks(
-    runner: StageRunner, scene_map: Artefact, registrations: ByCamera, keyframes: ByCamera
-) -> ByCamera:
+def compare_with_tracks(runner: StageRunner, results: StageResults, registrations: ByCamera) -> ByCamera:
     """Compare the final paths with the tracks of the videos."""
     tasks = {
         name: LinksTask(
-            keyframes=artefact_ref(keyframes[name]),
-            map=artefact_ref(scene_map),
+            keyframes=artefact_ref(results.keyframes[name]),
+            map=artefact_ref(results.scene_map),
             registration=artefact_ref(registration),
         )
         for name, registration in registrations.items()
@@ -451,7 +414,7 @@ def compare_with_tracks(
     return runner.run_all(make_task(task, camera=name) for name, task in tasks.items())
 
 
-def contradicted_lenses(runner: StageRunner, facts: JobFacts, links: ByCamera) -> Mapping[str, float]:
+def contradicted_lenses(runner: StageRunner, results: StageResults) -> Mapping[str, float]:
     """Return the given focal length over the width of each camera whose path the video contradicts, by name.
 
     A given lens that is some percent wrong bends the map, and a map of few points does not show it. A wrong
@@ -459,9 +422,9 @@ def contradicted_lenses(runner: StageRunner, facts: JobFacts, links: ByCamera) -
     """
     given = {
         camera.name: camera.calibration.camera()
-        for camera in facts.job.capture.cameras
+        for camera in results.facts.job.capture.cameras
         if isinstance(camera.calibration, Calibration)
-        and contradicted_share(read_summary(links[camera.name].path)) > MAX_CONTRADICTED
+        and contradicted_share(read_summary(results.links[camera.name].path)) > MAX_CONTRADICTED
     }
     if not given or not is_on(Mechanism.FREED_LENSES):
         return {}
@@ -473,14 +436,7 @@ def contradicted_lenses(runner: StageRunner, facts: JobFacts, links: ByCamera) -
     return {name: lens.focal_px / lens.width_px for name, lens in given.items()}
 
 
-def measure_rotations(
-    runner: StageRunner,
-    facts: JobFacts,
-    scene_map: Artefact,
-    registrations: ByCamera,
-    keyframes: ByCamera,
-    links: ByCamera,
-) -> tuple[ByCamera, ByCamera]:
+def measure_rotations(runner: StageRunner, results: StageResults) -> tuple[ByCamera, ByCamera]:
     """Measure the rotations of the cameras whose positions say nothing, and withdraw these positions.
 
     A job with a body keeps the positions: the body needs them, and its scale can make them certain.
@@ -491,46 +447,41 @@ def measure_rotations(
     Raises:
         EstimationError: There is no map, and the cameras move.
     """
+    facts, registrations, links = results.facts, results.registrations, results.links
     if not _may_be_rotations(facts):
         return registrations, links
 
     def task(camera: CameraConfig) -> RotationsTask:
         return RotationsTask(
             capture=facts.footage([camera]),
-            keyframes=refs_by_camera({camera.name: keyframes[camera.name]}),
-            map=artefact_ref(scene_map),
+            keyframes=refs_by_camera({camera.name: results.keyframes[camera.name]}),
+            map=artefact_ref(results.scene_map),
             registration=artefact_ref(registrations[camera.name]),
         )
 
     names = without_positions({name: read_summary(each.path) for name, each in links.items()})
     measured = _run_per_camera(runner, facts, task, names=names)
     turned = {name: each for name, each in measured.items() if read_summary(each.path)["rotations"]}
-    if not turned and (failure := map_failure(scene_map)) is not None:
+    if not turned and (failure := map_failure(results.scene_map)) is not None:
         raise failure
-    again = compare_with_tracks(runner, scene_map, turned, keyframes)
+    again = compare_with_tracks(runner, results, turned)
     return {**registrations, **turned}, {**links, **again}
 
 
-def merge(
-    runner: StageRunner,
-    facts: JobFacts,
-    scene_map: Artefact,
-    registrations: ByCamera,
-    clocks: Artefact,
-    keyframes: ByCamera,
-) -> Artefact:
+def merge(runner: StageRunner, results: StageResults) -> Artefact:
     """Solve the motion of the skeleton in the world.
 
     Raises:
         EstimationError: The data do not support a skeleton.
     """
-    job = facts.job
-    footage = BoardFootage(capture=facts.footage(), keyframes=refs_by_camera(keyframes))
+    assert results.clocks is not None
+    job = results.facts.job
+    footage = BoardFootage(capture=results.facts.footage(), keyframes=refs_by_camera(results.keyframes))
     task = MergeTask(
         options=job.merge,
-        map=artefact_ref(scene_map),
-        registrations=refs_by_camera(registrations),
-        clocks=artefact_ref(clocks),
+        map=artefact_ref(results.scene_map),
+        registrations=refs_by_camera(results.registrations),
+        clocks=artefact_ref(results.clocks),
         body=body_input(job, runner.settings.store.digests),
         footage=None if job.merge.marker_board is None else footage,
     )
@@ -541,15 +492,15 @@ def merge(
     return artefact
 
 
-def fill(runner: StageRunner, facts: JobFacts, merged: Artefact) -> Artefact:
+def fill(runner: StageRunner, results: StageResults) -> Artefact:
     """Pose the joints that no camera measured, and return the artefact of the motion of all joints."""
-    task = FillTask(mode=facts.job.fill, merge=artefact_ref(merged))
+    assert results.merged is not None
+    task = FillTask(mode=results.facts.job.fill, merge=artefact_ref(results.merged))
     return runner.run(make_task(task, threads=runner.settings.threads))
 
 
 def export(runner: StageRunner, results: StageResults) -> Artefact:
     """Write the result files of the stages before the export."""
-    assert results.map is not None
     assert results.clocks is not None
     facts = results.facts
     capture = facts.job.capture
@@ -557,7 +508,7 @@ def export(runner: StageRunner, results: StageResults) -> Artefact:
         options=facts.job.export,
         take=facts.job.name,
         capture=capture_ref(capture, facts.digests),
-        map=artefact_ref(results.map),
+        map=artefact_ref(results.scene_map),
         registrations=refs_by_camera(results.registrations),
         clocks=artefact_ref(results.clocks),
         keyframes=refs_by_camera(results.keyframes),
@@ -583,12 +534,11 @@ def undistort(
         exported: The artefact of the result files, which contain the facts about the cameras.
         cameras: Names of the cameras.
     """
-    assert results.map is not None
     tasks = [
         UndistortTask(
             camera=camera.name,
             capture=results.facts.footage([camera]),
-            map=artefact_ref(results.map),
+            map=artefact_ref(results.scene_map),
             export=artefact_ref(exported),
         )
         for camera in results.facts.capture.cameras
@@ -605,8 +555,7 @@ def start_preview(runner: StageRunner, results: StageResults) -> Future[Artefact
     """
     if runner.settings.until not in ("", "preview") or results.map is None:
         return None
-    assert results.clocks is not None
-    task = preview_task(results, results.map, results.clocks)
+    task = preview_task(results)
     return runner.start(partial(runner.run, make_task(task, threads=runner.settings.threads)))
 
 

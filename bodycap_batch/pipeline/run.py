@@ -127,22 +127,22 @@ def run_stages(runner: StageRunner, results: StageResults) -> Iterator[str]:
     yield "check"
     yield from _run_to_paths(runner, results)
     _try_without_lenses(runner, results)
-    assert results.map is not None
     try:
-        results.registrations, results.links = flow.measure_rotations(
-            runner, results.facts, results.map, results.registrations, results.keyframes, results.links
-        )
+        results.registrations, results.links = flow.measure_rotations(runner, results)
     except EstimationError:  # there is no map
         results.stage, results.map, results.clocks, results.registrations = "map", None, None, {}
         raise
     yield "registration"
     results.stage = "merge"
-    if results.failure is None:
-        results.merged, results.failure = _merge(runner, results)
+    if results.failure is None and has_body(results.facts.job):
+        try:
+            results.merged = flow.merge(runner, results)
+        except EstimationError as error:
+            results.failure = error
     yield "merge"
     if results.merged is not None:
         results.stage = "fill"
-        results.filled = flow.fill(runner, results.facts, results.merged)
+        results.filled = flow.fill(runner, results)
     yield "fill"
     results.preview = flow.start_preview(runner, results) if results.facts.job.export.preview else None
     results.exported = flow.export(runner, results)
@@ -156,38 +156,37 @@ def run_stages(runner: StageRunner, results: StageResults) -> Iterator[str]:
 
 def _run_to_paths(runner: StageRunner, results: StageResults) -> Iterator[str]:
     """Run the stages up to the final paths of the cameras, as `run_stages` does."""
-    facts, sound = results.facts, results.sound
     results.stage = "keyframes"
-    results.keyframes = keyframes = flow.select_keyframes(runner, facts)
-    if sound is not None:
+    results.keyframes = flow.select_keyframes(runner, results)
+    if results.sound is not None:
         # What the sound leaves open is said before the map. It was compared in much less time.
-        wait([sound])
+        wait([results.sound])
     yield "keyframes"
     results.stage = "map"
-    results.map = scene_map = flow.build_map(runner, facts, keyframes)
-    if sound is not None:
-        sound.result()
-    runner.report_notes(scene_map, "map")
+    results.map = flow.build_map(runner, results)
+    if results.sound is not None:
+        results.sound.result()
+    runner.report_notes(results.map, "map")
     yield "map"
     results.stage = "registration"
-    results.registrations = found = flow.register(runner, facts, scene_map, keyframes)
-    scene_map, found, rounds = flow.grow_map(runner, facts, scene_map, found, keyframes)
-    results.map, found = flow.refine_map(runner, facts, scene_map, found, keyframes, rounds + 1)
-    results.registrations = found = flow.recover(runner, facts, results.map, found, keyframes)
+    results.registrations = flow.register(runner, results)
+    refined = flow.refine_map(runner, flow.grow_map(runner, results))
+    results.map = refined.map
+    results.registrations = flow.recover(runner, refined)
     try:
-        results.facts = facts = flow.find_places(runner, facts, results.map, found, sound)
+        results.facts = flow.find_places(runner, results)
     except EstimationError as error:  # only the body needs the places
         results.failure = error
-    results.clocks = flow.decide_clocks(runner, facts, results.map, found, sound)
+    results.clocks = flow.decide_clocks(runner, results)
     runner.report_notes(results.clocks, "clocks")
-    found = flow.use_sensors(runner, facts, found)
-    results.map, results.registrations = flow.map_lost_parts(runner, facts, results.map, found, keyframes)
-    results.links = flow.compare_with_tracks(runner, results.map, results.registrations, keyframes)
+    with_sensors = replace(results, registrations=flow.use_sensors(runner, results))
+    results.map, results.registrations = flow.map_lost_parts(runner, with_sensors)
+    results.links = flow.compare_with_tracks(runner, results, results.registrations)
 
 
 def _try_without_lenses(runner: StageRunner, results: StageResults) -> None:
     """Compute the paths again without given lenses that may be wrong; `results` gets them if better."""
-    given = flow.contradicted_lenses(runner, results.facts, results.links)
+    given = flow.contradicted_lenses(runner, results)
     if not given:
         return
     facts = flow.identify_videos(runner.settings, results.facts.with_unknown_lenses(given))
@@ -311,28 +310,6 @@ def _publish_results(runner: StageRunner, results: StageResults, out_dir: Path) 
     _write_results(job, results, _summary(runner, results, partial), settings)
     _add_hint(results.failure, f"see {partial} for the map, the camera paths and the frames")
     return partial
-
-
-def _merge(runner: StageRunner, results: StageResults) -> tuple[Artefact | None, EstimationError | None]:
-    """Return the skeleton's motion, or the error if the data do not support a motion.
-
-    Both values are None if the job asks for no skeleton.
-    """
-    if not has_body(results.facts.job):
-        return None, None
-    assert results.map is not None
-    assert results.clocks is not None
-    try:
-        return flow.merge(
-            runner,
-            results.facts,
-            results.map,
-            results.registrations,
-            results.clocks,
-            results.keyframes,
-        ), None
-    except EstimationError as error:
-        return None, error
 
 
 def _write_results(job: Job, results: StageResults, summary: RunSummary, settings: Settings) -> None:

@@ -35,6 +35,7 @@ class StageResults:
             check, or if there is only one camera.
         keyframes: The artefact of each camera's keyframes, by camera name.
         map: The artefact of the map.
+        map_round: Round of the map, counted from 0: how often it was extended and refined.
         registrations: The registration of each camera after all further steps, by camera name.
         links: What the tracks of each camera's video show about its paths, by camera name.
         clocks: The artefact of the clocks of all cameras.
@@ -53,6 +54,7 @@ class StageResults:
     sound: Future[Artefact] | None = None
     keyframes: Mapping[str, Artefact] = field(default_factory=dict)
     map: Artefact | None = None
+    map_round: int = 0
     registrations: Mapping[str, Artefact] = field(default_factory=dict)
     links: Mapping[str, Artefact] = field(default_factory=dict)
     clocks: Artefact | None = None
@@ -63,6 +65,12 @@ class StageResults:
     preview: Future[Artefact] | None = None
     previewed: Artefact | None = None
     failure: EstimationError | None = None
+
+    @property
+    def scene_map(self) -> Artefact:
+        """The artefact of the map, in the stages after it."""
+        assert self.map is not None
+        return self.map
 
     def take_paths(self, other: StageResults) -> None:
         """Replace all up to the final paths of the cameras by the results of another run of these stages."""
@@ -101,20 +109,15 @@ def report_task(results: StageResults, digests: FileDigests, stopped_by: Bodycap
     )
 
 
-def preview_task(results: StageResults, scene_map: Artefact, clocks: Artefact) -> PreviewTask:
-    """Return the task that renders the results as a video.
-
-    Args:
-        results: The results of the job's stages up to the merge.
-        scene_map: The artefact of the map.
-        clocks: The artefact of the clocks of all cameras.
-    """
+def preview_task(results: StageResults) -> PreviewTask:
+    """Return the task that renders the results of the job's stages up to the merge as a video."""
+    assert results.clocks is not None
     return PreviewTask(
         capture=capture_ref(results.facts.job.capture, results.facts.digests),
         keyframes=refs_by_camera(results.keyframes),
         registrations=refs_by_camera(results.registrations),
-        map=artefact_ref(scene_map),
-        clocks=artefact_ref(clocks),
+        map=artefact_ref(results.scene_map),
+        clocks=artefact_ref(results.clocks),
         merge=optional_ref(results.filled),
         failure=None if results.failure is None else results.failure.message,
     )
