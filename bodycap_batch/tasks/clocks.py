@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.formats.dataclass_files import write_dataclass
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, StatedClock
 from bodycap_batch.tasks.loading import CLOCKS_NAME, load_map, load_registration
 from bodycap_batch.tasks.sound import load_sound
@@ -65,7 +66,6 @@ def run_clocks(task: ClocksTask, context: StageContext, files: Path) -> None:
         decide_clocks,
         stated_offsets,
     )
-    from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.mapping.validation.camera_distance_check import check_distances
 
     context.check_cancelled()

@@ -8,8 +8,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bodycap_batch.capture.timeline import join_chapters
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.model.scene import MapResult
+from bodycap_batch.model.take import Timecode, exact_rate
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_clocks, load_keyframes, load_map
 from bodycap_batch.tasks.motion import load_motion
@@ -19,7 +22,6 @@ from bodycap_batch.tasks.typed_json import omitted_from_key
 
 if TYPE_CHECKING:
     from bodycap_batch.export.export_inputs import VideoFacts
-    from bodycap_batch.model.scene import MapResult
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,10 +113,8 @@ def log_of(scene: MapResult, freed: Mapping[str, float]) -> Mapping[str, Any]:
 
 def _video_facts(capture: CaptureRef) -> dict[str, VideoFacts]:
     """Return what the files for 3D programs state about the video of each camera."""
-    from bodycap_batch.capture.timeline import join_chapters
     from bodycap_batch.clocks.container_times import read_timecode
     from bodycap_batch.export.export_inputs import VideoFacts
-    from bodycap_batch.model.take import Timecode, exact_rate
 
     facts = {}
     sidecars = {camera.name: camera.timestamps for camera in capture.config.cameras}

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from bodycap_batch.config.options import MapOptions, RegistrationOptions
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.mechanisms import Mechanism, record_act
+from bodycap_batch.formats.dataclass_files import write_dataclass
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.mapping import save_map
@@ -55,7 +57,6 @@ class FurtherPosesTask:
 
 def run_further_maps(task: FurtherMapsTask, context: StageContext, files: Path) -> None:
     """Build the further maps; store them with the maps to which the paths refer."""
-    from bodycap_batch.core.mechanisms import Mechanism, record_act
     from bodycap_batch.mapping import map_lost_keyframes
 
     previous = load_map(task.map.path)
@@ -69,7 +70,6 @@ def run_further_maps(task: FurtherMapsTask, context: StageContext, files: Path) 
 
 def run_further_poses(task: FurtherPosesTask, context: StageContext, files: Path) -> None:
     """Store the camera's registration, and the poses of its lost frames in further maps."""
-    from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.registration import localise_in_other_maps
 
     camera = load_capture(task.capture, task.keyframes, threads=context.threads).cameras[0]

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from bodycap_batch.formats.dataclass_files import read_dataclass
+from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.tasks.inputs import ArtefactRef
-
-if TYPE_CHECKING:
-    from bodycap_batch.model.merge_data import MergeResult
 
 MOTION_NAME = "merge"
 """Name of the file, without suffix, that holds the motion."""
@@ -15,7 +12,4 @@ MOTION_NAME = "merge"
 
 def load_motion(artefact: ArtefactRef) -> MergeResult:
     """Read the motion of the skeleton from an artefact."""
-    from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.model.merge_data import MergeResult
-
     return read_dataclass(MergeResult, artefact.path, MOTION_NAME)

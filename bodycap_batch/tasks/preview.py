@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from bodycap_batch.capture import Capture
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.model.geometry import Similarity
+from bodycap_batch.model.merge_data import MergeResult
+from bodycap_batch.model.scene import Map
+from bodycap_batch.model.skeleton_presets import split_side
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_clocks, load_map, load_registration
 from bodycap_batch.tasks.motion import load_motion
@@ -15,12 +22,6 @@ from bodycap_batch.tasks.registered_cameras import RegisteredCameras
 from bodycap_batch.tasks.stage import RESULTS_FOLDER
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from bodycap_batch.capture import Capture
-    from bodycap_batch.model.geometry import Similarity
-    from bodycap_batch.model.merge_data import MergeResult
-    from bodycap_batch.model.scene import Map
     from bodycap_batch.preview import PreviewInputs
 
 
@@ -55,7 +56,6 @@ def run_preview(task: PreviewTask, context: StageContext, files: Path) -> None:
 
 
 def _preview_inputs(task: PreviewTask, path: Path, threads: int) -> PreviewInputs:
-    import numpy as np
 
     from bodycap_batch.overlay import bones_from_motion, make_camera_views
     from bodycap_batch.preview import PreviewInputs
@@ -88,10 +88,6 @@ def _transforms_of(maps: Sequence[Map], merge: MergeResult | None) -> dict[str, 
     With a motion, these are the transforms of all maps that merging placed in the world. Without a motion,
     only the largest map is shown, untransformed.
     """
-    import numpy as np
-
-    from bodycap_batch.model.geometry import Similarity
-
     if merge is not None:
         return dict(merge.world_from_map)
     return {maps[0].gauge: Similarity(1.0, np.eye(3), np.zeros(3))}
@@ -102,10 +98,6 @@ def _trunk_first(capture: Capture, merge: MergeResult | None) -> Capture:
 
     The preview shows the cameras on the trunk largest.
     """
-    from dataclasses import replace
-
-    from bodycap_batch.model.skeleton_presets import split_side
-
     if merge is None:
         return capture
     limb = {mount.camera: split_side(mount.role)[0] != "" for mount in merge.mounts}

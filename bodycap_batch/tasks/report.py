@@ -8,7 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bodycap_batch.capture import Capture
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.formats.dataclass_files import read_dataclass
+from bodycap_batch.model.camera_clock import CaptureClocks, FrameTiming
 from bodycap_batch.tasks.body import load_body
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_clocks, load_keyframes, load_map, load_registration
@@ -16,8 +20,6 @@ from bodycap_batch.tasks.motion import load_motion
 from bodycap_batch.tasks.stage import RESULTS_FOLDER
 
 if TYPE_CHECKING:
-    from bodycap_batch.capture import Capture
-    from bodycap_batch.model.camera_clock import CaptureClocks
     from bodycap_batch.report import ReportInputs
 
 
@@ -72,8 +74,6 @@ def load_inputs(task: ReportTask, threads: int = 0) -> ReportInputs:
         task: The report's task, which names the stored results.
         threads: Number of threads of each video decoder; 0 lets the decoder choose.
     """
-    from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.model.camera_clock import CaptureClocks, FrameTiming
     from bodycap_batch.report import ReportInputs
 
     paths = paths_of(task.registrations.values())
@@ -121,8 +121,6 @@ def _open_capture(task: ReportTask, clocks: CaptureClocks, threads: int) -> Capt
     Raises:
         CaptureError: The videos cannot be read, but the job has not failed.
     """
-    from bodycap_batch.core.errors import CaptureError
-
     try:
         return load_capture(task.capture, task.keyframes, clocks=clocks, threads=threads)
     except CaptureError:

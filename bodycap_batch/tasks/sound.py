@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from bodycap_batch.config.models import CaptureConfig
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
 from bodycap_batch.tasks.inputs import CaptureRef
 from bodycap_batch.tasks.stage import write_summary
 
@@ -32,7 +33,6 @@ class SoundTask:
 def run_sound(task: SoundTask, context: StageContext, files: Path) -> None:
     """Compare the sound of all pairs of cameras, and store what it says about the clocks."""
     from bodycap_batch.clocks import measure_sound
-    from bodycap_batch.formats.dataclass_files import write_dataclass
 
     context.check_cancelled()
     found = measure_sound(task.capture.config, context.threads)
@@ -47,7 +47,6 @@ def load_sound(artefact: Path | None) -> SoundEvidence:
         artefact: Folder of the artefact of the stage `sound`; None if there is only one camera.
     """
     from bodycap_batch.clocks import SoundEvidence
-    from bodycap_batch.formats.dataclass_files import read_dataclass
 
     return SoundEvidence() if artefact is None else read_dataclass(SoundEvidence, artefact, SOUND_NAME)
 

@@ -19,7 +19,7 @@ from bodycap_batch.tasks.keyframes import KeyframesTask, run_keyframes
 from bodycap_batch.tasks.links import LinksTask, run_links
 from bodycap_batch.tasks.mapping import ExtendTask, MapTask, RefineTask, run_extend, run_map, run_refine
 from bodycap_batch.tasks.merge import MergeTask, run_merge
-from bodycap_batch.tasks.order import STAGE_ORDER, StageName
+from bodycap_batch.tasks.order import CHECK_MODULES, STAGE_ORDER, VIDEO_MODULES, StageName
 from bodycap_batch.tasks.places import PlacesTask, run_places
 from bodycap_batch.tasks.preview import PreviewTask, run_preview
 from bodycap_batch.tasks.recover import RecoverTask, run_recover
@@ -33,9 +33,7 @@ from bodycap_batch.tasks.undistort import UndistortTask, run_undistort
 
 _VIDEO = ("numpy", "av", "opencv-python-headless|opencv-python")
 """Python distributions that a stage needs to decode and process images."""
-_VIDEO_MODULES = ("bodycap_batch.capture", "bodycap_batch.config.models", "cv2", "av")
-"""Modules that a stage loads to decode and process images."""
-_MAP_MODULES = (*_VIDEO_MODULES, "pycolmap", "bodycap_batch.mapping")
+_MAP_MODULES = (*VIDEO_MODULES, "pycolmap", "bodycap_batch.mapping")
 _MAP_MEMORY_MB = 1500
 """Memory to reserve (MB) for a task that builds, extends or refines a map.
 Evidence: docs/decisions/pipeline.md."""
@@ -90,19 +88,16 @@ class Stage(Generic[_TaskT]):
 
 _TABLE: tuple[Stage[Any], ...] = (
     Stage("synth", SynthTask, run_synth, None, ("numpy", "av", "open3d-cpu|open3d")),
-    Stage(
-        "check", CheckTask, run_check, "check", _VIDEO,
-        (*_VIDEO_MODULES, "bodycap_batch.check", "bodycap_batch.telemetry.gopro"),
-    ),
-    Stage("sound", SoundTask, run_sound, "keyframes", _VIDEO, _VIDEO_MODULES),
+    Stage("check", CheckTask, run_check, "check", _VIDEO, CHECK_MODULES),
+    Stage("sound", SoundTask, run_sound, "keyframes", _VIDEO, VIDEO_MODULES),
     Stage(
         "keyframes", KeyframesTask, run_keyframes, "keyframes", _VIDEO,
-        (*_VIDEO_MODULES, "bodycap_batch.keyframes", "pycolmap"),
+        (*VIDEO_MODULES, "bodycap_batch.keyframes", "pycolmap"),
     ),
     Stage("map", MapTask, run_map, "map", (*_VIDEO, "pycolmap"), _MAP_MODULES, _MAP_MEMORY_MB),
     Stage(
         "registration", RegistrationTask, run_registration, "registration", (*_VIDEO, "pycolmap"),
-        (*_VIDEO_MODULES, "pycolmap", "bodycap_batch.registration"),
+        (*VIDEO_MODULES, "pycolmap", "bodycap_batch.registration"),
     ),
     Stage(
         "extend", ExtendTask, run_extend, "registration", (*_VIDEO, "pycolmap"), _MAP_MODULES, _MAP_MEMORY_MB
@@ -112,7 +107,7 @@ _TABLE: tuple[Stage[Any], ...] = (
     ),
     Stage(
         "recover", RecoverTask, run_recover, "registration", (*_VIDEO, "pycolmap"),
-        (*_VIDEO_MODULES, "pycolmap"), _RECOVERY_MEMORY_MB,
+        (*VIDEO_MODULES, "pycolmap"), _RECOVERY_MEMORY_MB,
     ),
     Stage(
         "places", PlacesTask, run_places, "registration", ("numpy", "scipy"), ("bodycap_batch.camera_places",)
@@ -123,7 +118,7 @@ _TABLE: tuple[Stage[Any], ...] = (
     ),
     Stage(
         "inertial", InertialTask, run_inertial, "registration", (*_VIDEO, "scipy"),
-        (*_VIDEO_MODULES, "bodycap_batch.inertial", "scipy.optimize", "scipy.interpolate"),
+        (*VIDEO_MODULES, "bodycap_batch.inertial", "scipy.optimize", "scipy.interpolate"),
     ),
     Stage(
         "further_maps", FurtherMapsTask, run_further_maps, "registration", (*_VIDEO, "pycolmap"),
@@ -131,7 +126,7 @@ _TABLE: tuple[Stage[Any], ...] = (
     ),
     Stage(
         "further_poses", FurtherPosesTask, run_further_poses, "registration", (*_VIDEO, "pycolmap"),
-        (*_VIDEO_MODULES, "pycolmap", "bodycap_batch.registration"),
+        (*VIDEO_MODULES, "pycolmap", "bodycap_batch.registration"),
     ),
     Stage(
         "links", LinksTask, run_links, "registration",
@@ -140,7 +135,7 @@ _TABLE: tuple[Stage[Any], ...] = (
     ),
     Stage(
         "rotations", RotationsTask, run_rotations, "registration", (*_VIDEO, "pycolmap", "scipy"),
-        (*_VIDEO_MODULES, "pycolmap"),
+        (*VIDEO_MODULES, "pycolmap"),
     ),
     Stage(
         "merge", MergeTask, run_merge, "merge", ("scipy", "gtsam", *_VIDEO),
@@ -160,15 +155,15 @@ _TABLE: tuple[Stage[Any], ...] = (
     ),
     Stage(
         "report", ReportTask, run_report, "report", (*_VIDEO, "jinja2", "k3d", "pycolmap", "scipy"),
-        (*_VIDEO_MODULES, "bodycap_batch.report", "jinja2", "pycolmap", "scipy.spatial.transform"),
+        (*VIDEO_MODULES, "bodycap_batch.report", "jinja2", "pycolmap", "scipy.spatial.transform"),
     ),
     Stage(
         "preview", PreviewTask, run_preview, "preview", (*_VIDEO, "scipy", "pycolmap"),
-        (*_VIDEO_MODULES, "bodycap_batch.preview", "pycolmap", "scipy.spatial.transform"),
+        (*VIDEO_MODULES, "bodycap_batch.preview", "pycolmap", "scipy.spatial.transform"),
     ),
     Stage(
         "undistort", UndistortTask, run_undistort, None, (*_VIDEO, "pycolmap"),
-        (*_VIDEO_MODULES, "bodycap_batch.preview", "pycolmap"),
+        (*VIDEO_MODULES, "bodycap_batch.preview", "pycolmap"),
     ),
 )  # fmt: skip
 STAGES: Mapping[str, Stage[Any]] = {stage.name: stage for stage in _TABLE}

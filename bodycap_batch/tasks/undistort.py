@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
+
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.model.camera import with_two_focal_lengths
+from bodycap_batch.model.pinhole import pinhole_of
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_map
 from bodycap_batch.tasks.stage import RESULTS_FOLDER
@@ -32,14 +37,7 @@ class UndistortTask:
 
 def run_undistort(task: UndistortTask, context: StageContext, files: Path) -> None:
     """Write the clip of the camera."""
-    from dataclasses import replace
-    from fractions import Fraction
-
-    import numpy as np
-
     from bodycap_batch.export.camera_files import CAMERA_FACTS_FILE
-    from bodycap_batch.model.camera import with_two_focal_lengths
-    from bodycap_batch.model.pinhole import pinhole_of
     from bodycap_batch.preview import UndistortedClip, write_undistorted_clip
 
     text = (task.export.path / RESULTS_FOLDER / CAMERA_FACTS_FILE).read_text(encoding="utf-8")
