@@ -40,7 +40,7 @@ from bodycap_batch.runner.child_pool import NOTHING_TO_LOAD, Preload
 from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.tasks.body import camera_distances
 from bodycap_batch.tasks.check import CheckTask
-from bodycap_batch.tasks.clocks import CameraDistance, ClocksTask
+from bodycap_batch.tasks.clocks import ClocksTask
 from bodycap_batch.tasks.export import ExportTask
 from bodycap_batch.tasks.fill import FillTask
 from bodycap_batch.tasks.further import FurtherMapsTask, FurtherPosesTask
@@ -294,10 +294,7 @@ def decide_clocks(runner: StageRunner, results: StageResults, trunk: str = "") -
         sound=optional_ref(None if sound is None else sound.result()),
         map=artefact_ref(results.scene_map),
         registrations=refs_by_camera(results.registrations),
-        reach=tuple(
-            CameraDistance(first=first, second=second, least_m=least_m, most_m=most_m)
-            for first, second, least_m, most_m in ([] if body is None else camera_distances(body))
-        ),
+        reach=() if body is None else tuple(camera_distances(body)),
     )
     return runner.run(make_task(task))
 

@@ -43,7 +43,6 @@ def run_check(task: CheckTask, context: StageContext, files: Path) -> None:
     from bodycap_batch.check import require_ready, require_within_limits
     from bodycap_batch.telemetry.gopro import has_telemetry_track, states_stabilisation
 
-    context.check_cancelled()
     if task.limits is not None:
         require_within_limits(task.job, task.limits)
     report = require_ready(task.job, context.threads)

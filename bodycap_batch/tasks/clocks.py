@@ -15,23 +15,6 @@ from bodycap_batch.tasks.stage import write_summary
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CameraDistance:
-    """The smallest and largest distance that the body permits between two cameras.
-
-    Attributes:
-        first: Name of the first camera.
-        second: Name of the second camera.
-        least_m: Smallest distance (metres), for a body of the skeleton's nominal size.
-        most_m: Largest distance (metres), for a body of the skeleton's nominal size.
-    """
-
-    first: str
-    second: str
-    least_m: float
-    most_m: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ClocksTask:
     """Decide which clock each camera has.
 
@@ -43,7 +26,8 @@ class ClocksTask:
         sound: What the sound says; None if there is only one camera.
         map: The map.
         registrations: The registration of each camera, by camera name.
-        reach: Distances between cameras that the body permits.
+        reach: Rows of names of two cameras, and smallest and largest distance (metres) that the body permits
+            between them, for a body of the skeleton's nominal size.
     """
 
     capture: CaptureRef
@@ -53,10 +37,10 @@ class ClocksTask:
     sound: ArtefactRef | None
     map: ArtefactRef
     registrations: Mapping[str, ArtefactRef]
-    reach: tuple[CameraDistance, ...]
+    reach: tuple[tuple[str, str, float, float], ...]
 
 
-def run_clocks(task: ClocksTask, context: StageContext, files: Path) -> None:
+def run_clocks(task: ClocksTask, _: StageContext, files: Path) -> None:
     """Decide which clock each camera has, and store the clocks."""
     from bodycap_batch.clocks import (
         add_motion,
@@ -68,7 +52,6 @@ def run_clocks(task: ClocksTask, context: StageContext, files: Path) -> None:
     )
     from bodycap_batch.mapping.validation.camera_distance_check import check_distances
 
-    context.check_cancelled()
     capture = task.capture.config
     evidence = load_sound(None if task.sound is None else task.sound.path)
     paths = [load_registration(artefact.path).trajectory for artefact in task.registrations.values()]
@@ -80,7 +63,7 @@ def run_clocks(task: ClocksTask, context: StageContext, files: Path) -> None:
         estimates = add_motion(estimates, motion, evidence, stated_s)
     clocks = decide_clocks(capture, estimates)
     write_dataclass(clocks, files, CLOCKS_NAME)
-    reach = {(pair.first, pair.second): (pair.least_m, pair.most_m) for pair in task.reach}
+    reach = {(first, second): (least_m, most_m) for first, second, least_m, most_m in task.reach}
     distances = None
     if reach:
         times_ns = {path.camera: path.times_ns for path in paths}

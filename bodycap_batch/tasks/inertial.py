@@ -52,7 +52,6 @@ def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None
     from bodycap_batch.telemetry import read_telemetry
     from bodycap_batch.telemetry.comparison import all_times_ns
 
-    context.check_cancelled()
     capture, configs = open_capture(task.capture.config, context.threads), task.capture.config.cameras
     camera = capture.cameras[0]
     times_ns = all_times_ns(camera, configs[0])

@@ -33,11 +33,10 @@ class PlacesTask:
     registrations: Mapping[str, ArtefactRef]
 
 
-def run_places(task: PlacesTask, context: StageContext, files: Path) -> None:
+def run_places(task: PlacesTask, _: StageContext, files: Path) -> None:
     """Find the places, and store them in the summary."""
     from bodycap_batch.camera_places import FoundPlaces, find_places_with
 
-    context.check_cancelled()
     paths = [load_registration(artefact.path).trajectory for artefact in task.registrations.values()]
     if len({path.gauge for path in paths}) > 1:
         found = FoundPlaces(by_camera={}, reason="the cameras are not in one map")

@@ -42,7 +42,6 @@ def run_recover(task: RecoverTask, context: StageContext, files: Path) -> None:
         with_rotation,
     )
 
-    context.check_cancelled()
     capture = load_capture(task.capture, task.keyframes, threads=context.threads)
     paths = paths_of(task.registrations.values())
     scene = load_map(task.map.path)

@@ -34,7 +34,6 @@ def run_sound(task: SoundTask, context: StageContext, files: Path) -> None:
     """Compare the sound of all pairs of cameras, and store what it says about the clocks."""
     from bodycap_batch.clocks import measure_sound
 
-    context.check_cancelled()
     found = measure_sound(task.capture.config, context.threads)
     write_dataclass(found, files, SOUND_NAME)
     write_summary(files)

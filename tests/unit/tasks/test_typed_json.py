@@ -23,7 +23,7 @@ from bodycap_batch.pipeline.inputs import capture_ref
 from bodycap_batch.pipeline.task_keys import artefact_key, make_task
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.tasks.check import CheckTask
-from bodycap_batch.tasks.clocks import CameraDistance, ClocksTask
+from bodycap_batch.tasks.clocks import ClocksTask
 from bodycap_batch.tasks.export import ExportTask
 from bodycap_batch.tasks.fill import FillTask
 from bodycap_batch.tasks.further import FurtherMapsTask, FurtherPosesTask
@@ -139,7 +139,7 @@ def tasks(folder: Path) -> dict[str, Any]:
             sound=scene_map,
             map=scene_map,
             registrations=stored,
-            reach=(CameraDistance(first="head", second="torso", least_m=0.1, most_m=0.9),),
+            reach=(("head", "torso", 0.1, 0.9),),
         ),
         "places": PlacesTask(stated={"a": "torso"}, clocks={"": scene_map}, registrations=stored),
         "merge": MergeTask(
