@@ -32,7 +32,7 @@ from bodycap_batch.cli.terminal import print_line, print_text
 from bodycap_batch.core.errors import BodycapError, JobError
 from bodycap_batch.core.progress import Event
 from bodycap_batch.job_places import find_job
-from bodycap_batch.tasks.order import STAGE_ORDER, StageName, stages_from
+from bodycap_batch.tasks.order import CHECK_MODULES, STAGE_ORDER, StageName
 
 if TYPE_CHECKING:
     from bodycap_batch.pipeline import RunSummary
@@ -85,7 +85,6 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
     from bodycap_batch.config.body_height import describe_height
     from bodycap_batch.config.folder import RUN_FILE, job_file_in
     from bodycap_batch.runner import Children
-    from bodycap_batch.tasks.check import CHECK
 
     if force and from_ is not None:
         raise JobError(
@@ -110,7 +109,7 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
             progress=display,
             cancelled=stop.is_set,
             children=Children(),
-            redo=frozenset() if first_repeated is None else stages_from(first_repeated),
+            redo=_stages_from(first_repeated),
             until=until or "",
             results_ready=lambda folder: announce(
                 f"the results are in {folder}; only preview.mp4 is still being made"
@@ -131,12 +130,21 @@ def run(  # noqa: PLR0913, PLR0917 - the flags a user types
         if execution.children is not None and not (loaded.out / RUN_FILE).exists():
             # With results, all stages may be stored, which needs no child. The child loads the libraries of
             # the first stage while this process imports the pipeline.
-            execution.children.start_ahead(CHECK.modules)
+            execution.children.start_ahead(CHECK_MODULES)
         summary = execute_job(loaded, execution)
     _print_summary(summary, loaded.name, display, verbose=verbose)
     if summary.unmet is not None:
         with _report_errors_as_json(display):
             raise summary.unmet
+
+
+def _stages_from(first: StageName | None) -> frozenset[str]:
+    """Return the names of the stages that are repeated, from the first one on; none for None."""
+    if first is None:
+        return frozenset()
+    from bodycap_batch.tasks.stages import stages_from
+
+    return stages_from(first)
 
 
 @contextmanager

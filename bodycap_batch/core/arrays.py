@@ -97,9 +97,7 @@ def evenly_spaced(count: int, limit: int) -> IntArray:
 
 def true_spans(mask: BoolArray) -> list[list[int]]:
     """Return the first and the last index of each series of True in a mask (T,)."""
-    edges = np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8))
-    starts, ends = np.flatnonzero(edges == 1).tolist(), (np.flatnonzero(edges == -1) - 1).tolist()
-    return [[start, end] for start, end in zip(starts, ends, strict=True)]
+    return [[start, stop - 1] for start, stop in runs(mask)]
 
 
 def json_numbers(values: FloatArray, decimals: int) -> list[float | None]:

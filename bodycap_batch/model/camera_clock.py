@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -134,11 +134,7 @@ class CaptureClocks:
 
     def with_timing(self, timings: Mapping[str, FrameTiming]) -> dict[str, CameraClock]:
         """Return the clocks of the cameras with a known frame timing, by camera name."""
-        clocks = {}
-        for name, timing in timings.items():
-            clocks[name] = CameraClock(
-                nominal_fps=timing.nominal_fps,
-                rolling_shutter_s=timing.rolling_shutter_s,
-                **self.cameras.get(name, ClockRelation()).values(),
-            )
-        return clocks
+        return {
+            name: CameraClock(**asdict(timing), **self.cameras.get(name, ClockRelation()).values())
+            for name, timing in timings.items()
+        }

@@ -62,7 +62,6 @@ class GravityFit:
         gravity_m_s2: Magnitude of the measured gravity.
         metres_per_unit: Metric scale of the gauge.
         scale_sigma: Standard deviation of its logarithm; infinity if it is unknown.
-        noise_m_s2: Robust standard deviation of the residuals of a window, per axis.
         windows: Number of windows.
         solution: (4+9C,) up · gravity, scale, and per camera bias, distance, turn.
         covariance: (4+9C,4+9C) covariance of the solution.
@@ -73,7 +72,6 @@ class GravityFit:
     gravity_m_s2: float
     metres_per_unit: float
     scale_sigma: float
-    noise_m_s2: float
     windows: int
     solution: FloatArray
     covariance: FloatArray
@@ -118,7 +116,7 @@ def fit_gravity(cameras: Sequence[ForceWindows]) -> GravityFit | None:
         weight = 1.0 / (1.0 + (size / (2.5 * noise)) ** 2) ** 2
     covariance = np.linalg.inv(information) * _growth(cameras, values - rows @ solution, weight)
     covariance[3, 3] += (_SENSITIVITY_SIGMA * solution[3]) ** 2 / (3.0 * len(cameras))
-    return _fit_of(solution, covariance, noise, len(values))
+    return _fit_of(solution, covariance, len(values))
 
 
 def _path_noise(error: FloatArray, weight: FloatArray, scale: float) -> float:
@@ -143,7 +141,7 @@ def _leverage(rows: FloatArray, weight: FloatArray, information: FloatArray) -> 
     return np.asarray(np.clip(taken, 0.0, _MAX_LEVERAGE))
 
 
-def _fit_of(solution: FloatArray, covariance: FloatArray, noise: float, windows: int) -> GravityFit:
+def _fit_of(solution: FloatArray, covariance: FloatArray, windows: int) -> GravityFit:
     gravity = float(np.linalg.norm(solution[:3]))
     up = solution[:3] / gravity
     across = np.eye(3) - np.outer(up, up)
@@ -156,7 +154,6 @@ def _fit_of(solution: FloatArray, covariance: FloatArray, noise: float, windows:
         gravity_m_s2=gravity,
         metres_per_unit=scale,
         scale_sigma=scale_sigma,
-        noise_m_s2=noise,
         windows=windows,
         solution=solution,
         covariance=covariance,

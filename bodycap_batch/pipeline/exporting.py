@@ -17,13 +17,14 @@ from bodycap_batch.formats.blender import write_blend
 from bodycap_batch.formats.blender.scene_script import SCENE_FILE, SCRIPT_FILE
 from bodycap_batch.formats.fbx import require_blender
 from bodycap_batch.formats.optional_libraries import require_formats
-from bodycap_batch.pipeline.flow import Flow
+from bodycap_batch.pipeline import flow
 from bodycap_batch.pipeline.inputs import has_body
 from bodycap_batch.pipeline.reporting import find_stored
 from bodycap_batch.pipeline.results import publish, write_results_file
 from bodycap_batch.pipeline.run import files_of
 from bodycap_batch.pipeline.settings import Settings
-from bodycap_batch.tasks.order import STAGE_ORDER
+from bodycap_batch.pipeline.stage_results import StageResults
+from bodycap_batch.pipeline.stage_runner import StageRunner
 
 GUIDE_FILE = "HOW_TO_IMPORT.txt"
 BLEND_FILE = "scene.blend"
@@ -67,10 +68,9 @@ def export_for(
         error = results.failure or stopped_by
         assert error is not None
         raise error
-    asked = job.model_copy(update={"export": options})
-    with Flow(asked, replace(settings, until=STAGE_ORDER[-1]), logs=out_dir / "logs") as flow:
-        flow.identify_videos()
-        exported = flow.export(results)
+    _set_export(results, options)
+    with StageRunner.of(job, settings, out_dir) as runner:
+        exported = flow.export(runner, results)
     files = {name: path for name, path in files_of(exported) if name not in _NOT_FOR_PROGRAMS}
     if program.file not in files:
         raise EstimationError(
@@ -81,7 +81,7 @@ def export_for(
     settings.raise_if_cancelled()
     publish(files, folder)
     if SCENE_FILE in files:
-        _name_videos(folder, results.job or job)
+        _name_videos(folder, results.facts.job)
     written = [folder / name for name in files]
     if target == "blender":
         written += _blend_file(folder, settings)
@@ -115,10 +115,9 @@ def export_undistorted(
         assert stopped_by is not None
         raise stopped_by
     options = job.export.model_copy(update={"formats": ("chan",), "fps": fps or job.export.fps})
-    asked = job.model_copy(update={"export": options})
-    with Flow(asked, replace(settings, until=STAGE_ORDER[-1]), logs=out_dir / "logs") as flow:
-        flow.identify_videos()
-        exported = flow.export(results)
+    _set_export(results, options)
+    with StageRunner.of(job, settings, out_dir) as runner:
+        exported = flow.export(runner, results)
         files = {name: path for name, path in files_of(exported) if name not in _NOT_FOR_PROGRAMS}
         if CAMERA_FACTS_FILE not in files:
             raise EstimationError(
@@ -127,11 +126,17 @@ def export_undistorted(
                 hint="look at the report: it says what is missing and why",
             )
         facts = json.loads(files[CAMERA_FACTS_FILE].read_text(encoding="utf-8"))
-        for clip in flow.undistort(results, exported, list(facts["cameras"])).values():
+        for clip in flow.undistort(runner, results, exported, facts["cameras"]).values():
             files |= dict(files_of(clip))
     settings.raise_if_cancelled()
     publish(files, folder)
     return [folder / name for name in files]
+
+
+def _set_export(results: StageResults, options: ExportOptions) -> None:
+    """Replace the export options of the job of these results."""
+    job = results.facts.job.model_copy(update={"export": options})
+    results.facts = replace(results.facts, job=job)
 
 
 def _name_videos(folder: Path, job: Job) -> None:

@@ -8,11 +8,13 @@ from pathlib import Path
 from bodycap_batch.config.folder import PARTIAL, RUN_FILE
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import BodycapError, StoreError
-from bodycap_batch.pipeline.flow import Flow
+from bodycap_batch.pipeline import flow
+from bodycap_batch.pipeline.job_facts import JobFacts
 from bodycap_batch.pipeline.results import publish
 from bodycap_batch.pipeline.run import files_of, run_stages
 from bodycap_batch.pipeline.settings import Settings
 from bodycap_batch.pipeline.stage_results import StageResults, report_task
+from bodycap_batch.pipeline.stage_runner import StageRunner
 from bodycap_batch.runner import NotStored
 from bodycap_batch.tasks.report import ReportTask
 
@@ -32,8 +34,7 @@ def stored_for_report(job: Job, *, out_dir: Path, settings: Settings) -> ReportT
         BodycapError: The videos cannot be read, the disk fails, or nothing of the job is stored.
     """
     results, stopped_by = find_stored(job, out_dir, settings)
-    failure = results.describe_failure(stopped_by or results.failure)
-    return report_task(job, results, {}, settings.store.digests, failure)
+    return report_task(results, settings.store.digests, stopped_by)
 
 
 def find_stored(
@@ -44,14 +45,14 @@ def find_stored(
     If the results of a stage are not stored, the returned results end before this stage, and the second value
     is the error that names the stage. Otherwise the second value is None.
     """
-    results = StageResults()
-    with Flow(job, replace(settings, compute=False, redo=frozenset()), logs=out_dir / "logs") as flow:
+    results = StageResults(facts=JobFacts.of(job))
+    with StageRunner.of(job, replace(settings, compute=False, redo=frozenset()), out_dir) as runner:
         try:
-            for stage in run_stages(job, flow, results):
+            for stage in run_stages(runner, results):
                 if stage == last:
                     break
         except NotStored as error:
-            if not flow.runner.records:
+            if not runner.records:
                 raise
             return results, error
     return results, None
@@ -83,9 +84,9 @@ def remake_report(job: Job, *, out_dir: Path, settings: Settings) -> Path:
             hint=stopped_by.hint,
         )
     again = replace(settings, redo=settings.redo | {"report"})
-    with Flow(job, again, logs=out_dir / "logs") as flow:
-        flow.check()
-        reported = flow.report(results, stopped_by)
+    with StageRunner.of(job, again, out_dir) as runner:
+        flow.check(runner, StageResults(facts=JobFacts.of(job)))
+        reported = flow.report(runner, results, stopped_by)
     is_complete = results.exported is not None and results.failure is None
     folder = out_dir if is_complete else out_dir / PARTIAL
     settings.raise_if_cancelled()

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import wait
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import yaml
@@ -23,8 +24,9 @@ from bodycap_batch.core.errors import (
     JobError,
     RequirementUnmet,
 )
-from bodycap_batch.pipeline.flow import Flow
+from bodycap_batch.pipeline import flow
 from bodycap_batch.pipeline.inputs import has_body
+from bodycap_batch.pipeline.job_facts import JobFacts
 from bodycap_batch.pipeline.requirement import unmet_requirement
 from bodycap_batch.pipeline.results import (
     clear_partial,
@@ -35,6 +37,7 @@ from bodycap_batch.pipeline.results import (
 )
 from bodycap_batch.pipeline.settings import Settings, StageRecord
 from bodycap_batch.pipeline.stage_results import StageResults
+from bodycap_batch.pipeline.stage_runner import StageRunner
 from bodycap_batch.report.summary import ResultSummary, summary_of_folder
 from bodycap_batch.store.artefacts import Artefact
 from bodycap_batch.store.checked_json import checked_json
@@ -94,18 +97,18 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
     """
     settings.store.sweep()
     settings.raise_if_cancelled()
-    results, runs_to_end = StageResults(), settings.until in ("", STAGE_ORDER[-1])
-    with Flow(job, settings, logs=out_dir / "logs") as flow:
-        stopped_by = _run_until(job, flow, results, out_dir, settings)
-        summary = _summary(flow, results, out_dir)
+    results, runs_to_end = StageResults(facts=JobFacts.of(job)), settings.until in ("", STAGE_ORDER[-1])
+    with StageRunner.of(job, settings, out_dir) as runner:
+        stopped_by = _run_until(runner, results, out_dir)
+        summary = _summary(runner, results, out_dir)
         if runs_to_end and results.exported is not None:
-            folder = _publish_results(results.job or job, flow, results, out_dir, settings)
+            folder = _publish_results(runner, results, out_dir)
             if stopped_by is not None:
                 _add_hint(stopped_by, f"see {folder} for the other results")
             if results.failure is None:
-                flow.runner.keep_only_these()
+                runner.keep_only_these()
         elif stopped_by is not None:
-            _publish_failure_report(flow, results, stopped_by, out_dir, settings)
+            _publish_failure_report(runner, results, stopped_by, out_dir)
     if (error := _combined_error(results.failure, stopped_by)) is not None:
         raise error
     if not runs_to_end:
@@ -115,104 +118,106 @@ def run_job(job: Job, *, out_dir: Path, settings: Settings) -> RunSummary:
     return replace(summary, verdict=verdict, unmet=unmet)
 
 
-def run_stages(job: Job, flow: Flow, results: StageResults) -> Iterator[str]:
+def run_stages(runner: StageRunner, results: StageResults) -> Iterator[str]:
     """Run the stages one after another, put their artefacts into `results`, and yield each stage's name.
 
     The name is yielded after the stage has finished. If the caller stops iterating, no further stage runs.
     """
-    flow.check()
+    flow.check(runner, results)
     yield "check"
-    yield from _run_to_paths(flow, results)
-    flow = _with_better_lenses(flow, results)
-    job = results.job or job
-    assert results.map is not None
+    yield from _run_to_paths(runner, results)
+    _try_without_lenses(runner, results)
     try:
-        results.registrations, results.links = flow.measure_rotations(
-            results.map, results.registrations, results.keyframes, results.links
-        )
+        results.registrations, results.links = flow.measure_rotations(runner, results)
     except EstimationError:  # there is no map
         results.stage, results.map, results.clocks, results.registrations = "map", None, None, {}
         raise
     yield "registration"
     results.stage = "merge"
-    if results.failure is None:
-        results.merged, results.failure = _merge(job, flow, results)
+    if results.failure is None and has_body(results.facts.job):
+        try:
+            results.merged = flow.merge(runner, results)
+        except EstimationError as error:
+            results.failure = error
     yield "merge"
     if results.merged is not None:
         results.stage = "fill"
-        results.filled = flow.fill(results.merged)
+        results.filled = flow.fill(runner, results)
     yield "fill"
-    results.preview = flow.start_preview(results) if job.export.preview else None
-    results.exported = flow.export(results)
+    results.preview = flow.start_preview(runner, results) if results.facts.job.export.preview else None
+    results.exported = flow.export(runner, results)
     yield "export"
-    results.reported = flow.report(results)
+    results.reported = flow.report(runner, results)
     yield "report"
     if results.preview is not None:
         results.previewed = results.preview.result()
         yield "preview"
 
 
-def _run_to_paths(flow: Flow, results: StageResults) -> Iterator[str]:
+def _run_to_paths(runner: StageRunner, results: StageResults) -> Iterator[str]:
     """Run the stages up to the final paths of the cameras, as `run_stages` does."""
     results.stage = "keyframes"
-    results.keyframes = keyframes = flow.keyframes()
+    results.keyframes = flow.select_keyframes(runner, results)
+    if results.sound is not None:
+        # What the sound leaves open is said before the map. It was compared in much less time.
+        wait([results.sound])
     yield "keyframes"
     results.stage = "map"
-    results.map = scene_map = flow.map(keyframes)
+    results.map = flow.build_map(runner, results)
+    if results.sound is not None:
+        results.sound.result()
+    runner.report_notes(results.map, "map")
     yield "map"
     results.stage = "registration"
-    results.registrations = found = flow.register(scene_map, keyframes)
-    scene_map, found = flow.extend_map(scene_map, found, keyframes)
-    results.map, found = flow.refine_map(scene_map, found, keyframes)
-    results.registrations = flow.recover(results.map, found, keyframes)
+    results.registrations = flow.register(runner, results)
+    refined = flow.refine_map(runner, flow.grow_map(runner, results))
+    results.map = refined.map
+    results.registrations = flow.recover(runner, refined)
     try:
-        results.job = flow.find_places(results.map, results.registrations)
+        results.facts = flow.find_places(runner, results)
     except EstimationError as error:  # only the body needs the places
         results.failure = error
-    results.clocks = flow.clocks(results.map, results.registrations)
-    found = flow.use_sensors(results.registrations)
-    results.map, results.registrations = flow.map_lost_parts(results.map, found, keyframes)
-    results.links = flow.compare_with_tracks(results.map, results.registrations, keyframes)
+    results.clocks = flow.decide_clocks(runner, results)
+    runner.report_notes(results.clocks, "clocks")
+    with_sensors = replace(results, registrations=flow.use_sensors(runner, results))
+    results.map, results.registrations = flow.map_lost_parts(runner, with_sensors)
+    results.links = flow.compare_with_tracks(runner, results, results.registrations)
 
 
-def _with_better_lenses(flow: Flow, results: StageResults) -> Flow:
-    """Compute the paths again without given lenses that may be wrong, and put them into `results` if better.
-
-    Returns:
-        The flow of the results.
-    """
-    other = flow.with_freed_lenses(results.links)
-    if other is None:
-        return flow
-    found, names = StageResults(), ", ".join(other.freed)
+def _try_without_lenses(runner: StageRunner, results: StageResults) -> None:
+    """Compute the paths again without given lenses that may be wrong; `results` gets them if better."""
+    given = flow.contradicted_lenses(runner, results)
+    if not given:
+        return
+    facts = flow.identify_videos(runner.settings, results.facts.with_unknown_lenses(given))
+    found, names = StageResults(facts=facts, sound=results.sound), ", ".join(given)
     try:
-        for stage in _run_to_paths(other, found):
-            if stage == "keyframes" and not other.shows_lenses(found.keyframes):
-                return flow
+        for stage in _run_to_paths(runner, found):
+            if stage == "keyframes" and not _show_lenses(found.keyframes, given):
+                return
     except EstimationError as error:
-        flow.runner.note(f"{names}: without the given lens there is no better map: {error.message}", "map")
-        return flow
+        runner.note(f"{names}: without the given lens there is no better map: {error.message}", "map")
+        return
     before, after = (
         {name: read_summary(each.path) for name, each in links.items()}
         for links in (results.links, found.links)
     )
-    is_right = all(contradicted_share(after[name]) <= MAX_CONTRADICTED for name in other.freed)
+    is_right = all(contradicted_share(after[name]) <= MAX_CONTRADICTED for name in given)
     if not is_right or confirmed_frames(after) <= confirmed_frames(before):
-        flow.runner.note(
-            f"{names}: the video does not confirm more without the given lens, so it stays", "map"
-        )
-        return flow
-    flow.runner.note(
+        runner.note(f"{names}: the video does not confirm more without the given lens, so it stays", "map")
+        return
+    runner.note(
         f"{names}: the video confirms the path with the lens that it shows, so this lens is used", "map"
     )
-    for each in fields(found):
-        setattr(results, each.name, getattr(found, each.name))
-    return other
+    results.take_paths(found)
 
 
-def _run_until(
-    job: Job, flow: Flow, results: StageResults, out_dir: Path, settings: Settings
-) -> BodycapError | None:
+def _show_lenses(keyframes: Mapping[str, Artefact], cameras: Iterable[str]) -> bool:
+    """Return whether the tracks of the videos determine the lenses of these cameras."""
+    return all(read_summary(keyframes[name].path)["lens"] for name in cameras)
+
+
+def _run_until(runner: StageRunner, results: StageResults, out_dir: Path) -> BodycapError | None:
     """Run the stages up to the last stage that the user wants.
 
     If the report is finished before the video of the results, the results are first published without the
@@ -223,11 +228,11 @@ def _run_until(
         or finished results can still be published. Otherwise the error is raised.
     """
     try:
-        for stage in run_stages(job, flow, results):
-            if stage == settings.until:
+        for stage in run_stages(runner, results):
+            if stage == runner.settings.until:
                 break
             if stage == "report" and results.preview is not None and not results.preview.done():
-                settings.results_ready(_publish_results(results.job or job, flow, results, out_dir, settings))
+                runner.settings.results_ready(_publish_results(runner, results, out_dir))
     except BodycapError as error:
         # Finished results are published even if their report could not be written.
         reportable = results.exported is not None or _is_about_data(error)
@@ -260,12 +265,12 @@ def _combined_error(failure: EstimationError | None, stopped_by: BodycapError | 
 
 
 def _publish_failure_report(
-    flow: Flow, results: StageResults, error: BodycapError, out_dir: Path, settings: Settings
+    runner: StageRunner, results: StageResults, error: BodycapError, out_dir: Path
 ) -> None:
     """Publish the report of a job that was stopped by an error before results were written."""
     try:
-        results.reported = flow.report(results, error)
-        settings.raise_if_cancelled()
+        results.reported = flow.report(runner, results, error)
+        runner.settings.raise_if_cancelled()
         publish(dict(files_of(results.reported)), out_dir / PARTIAL)
     except BodycapError as another:
         error.add_note(f"the report about this job could not be written: {another.message}")
@@ -279,40 +284,32 @@ def _add_hint(error: BodycapError, text: str) -> None:
         error.hint = f"{error.hint}; {text}" if error.hint else text
 
 
-def _summary(flow: Flow, results: StageResults, out_dir: Path) -> RunSummary:
+def _summary(runner: StageRunner, results: StageResults, out_dir: Path) -> RunSummary:
     """Return the summary of the results and tasks so far."""
     return RunSummary(
         out_dir=out_dir,
         files=tuple(_result_files(results)),
-        stages=tuple(flow.runner.records),
-        versions=_versions(flow),
+        stages=tuple(runner.records),
+        versions={
+            "bodycap_batch": bodycap_batch.__version__,
+            "python": platform.python_version(),
+            **dict(sorted(runner.libraries.items())),
+        },
     )
 
 
-def _publish_results(job: Job, flow: Flow, results: StageResults, out_dir: Path, settings: Settings) -> Path:
+def _publish_results(runner: StageRunner, results: StageResults, out_dir: Path) -> Path:
     """Publish the results and return their folder: ``partial`` if the skeleton could not be solved."""
+    settings, job = runner.settings, results.facts.job
     settings.raise_if_cancelled()
     if results.failure is None:
-        _write_results(job, results, _summary(flow, results, out_dir), settings)
+        _write_results(job, results, _summary(runner, results, out_dir), settings)
         clear_partial(out_dir)
         return out_dir
     partial = out_dir / PARTIAL
-    _write_results(job, results, _summary(flow, results, partial), settings)
+    _write_results(job, results, _summary(runner, results, partial), settings)
     _add_hint(results.failure, f"see {partial} for the map, the camera paths and the frames")
     return partial
-
-
-def _merge(job: Job, flow: Flow, results: StageResults) -> tuple[Artefact | None, EstimationError | None]:
-    """Return the skeleton's motion, or the error if the data do not support a motion.
-
-    Both values are None if the job asks for no skeleton.
-    """
-    if not has_body(job) or results.map is None or results.clocks is None:
-        return None, None
-    try:
-        return flow.merge(results.map, results.registrations, results.clocks, results.keyframes), None
-    except EstimationError as error:
-        return None, error
 
 
 def _write_results(job: Job, results: StageResults, summary: RunSummary, settings: Settings) -> None:
@@ -348,11 +345,6 @@ def _recorded_path(path: Path, out_dir: Path) -> str:
     """Return a path for the record of a run: relative if it is beside the results, because both can move."""
     beside = path.is_relative_to(out_dir.parent)
     return os.path.relpath(path, out_dir) if beside else str(path)
-
-
-def _versions(flow: Flow) -> dict[str, str]:
-    own = {"bodycap_batch": bodycap_batch.__version__, "python": platform.python_version()}
-    return {**own, **dict(sorted(flow.runner.libraries.items()))}
 
 
 def files_of(artefact: Artefact) -> list[tuple[str, Path]]:

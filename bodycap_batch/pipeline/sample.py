@@ -22,7 +22,7 @@ from bodycap_batch.store.references import References, in_use
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.tasks.inputs import FileRef
 from bodycap_batch.tasks.stage import CAPTURE_FOLDER
-from bodycap_batch.tasks.synth import SYNTH, SynthTask
+from bodycap_batch.tasks.synth import SynthTask
 
 _STAMP = ".rendered.json"
 
@@ -68,7 +68,7 @@ def _synth_task(options: Mapping[str, Any], settings: Settings) -> Task:
         motion=_motion_ref(checked.motion, settings.store.digests),
         motion_name=None if checked.motion is None else checked.motion.name,
     )
-    return make_task(SYNTH, task, threads=settings.threads)
+    return make_task(task, threads=settings.threads)
 
 
 def _motion_ref(path: Path | None, digests: FileDigests) -> FileRef | None:

@@ -12,7 +12,6 @@ from bodycap_batch.core.progress import Listener
 from bodycap_batch.runner import CHILD_COMMAND, Children, Executor, Rules, Runner, Task
 from bodycap_batch.runner.child_pool import stopped
 from bodycap_batch.runner.task_runner import allow
-from bodycap_batch.runner.turns import Turns, TurnTakingExecutor
 from bodycap_batch.store.artefacts import Store
 
 
@@ -49,8 +48,6 @@ class Settings:
         limits: Maximum sizes of the videos; None (no limits) for a job that the user runs directly.
         memory_mb: Memory limit (MB) of one task; None for four fifths of the machine's memory.
         overrides: Values of the command line, for the record of the run. The next run of the job keeps them.
-        turns: Object that lets only one job of this process compute an artefact at a time; None if the
-            process runs only this job.
     """
 
     store: Store
@@ -68,7 +65,6 @@ class Settings:
     limits: Limits | None = None
     memory_mb: int | None = None
     overrides: Overrides = field(default_factory=Overrides)
-    turns: Turns | None = None
 
     def runner(
         self, logs: Path, stop_also: Callable[[], bool] = _never, before: Callable[[Task], None] = allow
@@ -80,10 +76,9 @@ class Settings:
             stop_also: Function that returns True if the runner must stop for another reason.
             before: Called before a task runs; may raise an error to forbid the task.
         """
-        executor = self.executor or self.children or Children(self.command)
         return Runner(
             self.store,
-            executor if self.turns is None else TurnTakingExecutor(executor, self.turns),
+            self.executor or self.children or Children(self.command),
             logs=logs,
             listener=self.listener,
             rules=Rules(

@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.core.progress import Event
 from bodycap_batch.pipeline.settings import Settings, StageRecord
@@ -24,6 +25,7 @@ class StageRunner:
     """Runs the tasks of one job; a context manager that waits for its threads at the end.
 
     Attributes:
+        settings: Settings of the run: store, threads, listener, cancellation.
         records: The record of every task that has contributed to the results so far.
         libraries: Version of each library that these tasks used, by library name.
 
@@ -36,7 +38,7 @@ class StageRunner:
     def __init__(self, settings: Settings, *, logs: Path, cameras: int) -> None:
         self.records: list[StageRecord] = []
         self.libraries: dict[str, str] = {}
-        self._settings = settings
+        self.settings = settings
         self._cameras = cameras
         self._folders = (settings.store.root, logs.parent)
         self._stop_all = threading.Event()
@@ -47,9 +49,14 @@ class StageRunner:
         self._noted: set[str] = set()
         self._opened = ExitStack()
 
+    @staticmethod
+    def of(job: Job, settings: Settings, out_dir: Path) -> StageRunner:
+        """Return the runner of a job whose results are in the folder `out_dir`."""
+        return StageRunner(settings, logs=out_dir / "logs", cameras=len(job.capture.cameras))
+
     def __enter__(self) -> StageRunner:
         with ExitStack() as opened:
-            opened.enter_context(in_use(self._settings.store))
+            opened.enter_context(in_use(self.settings.store))
             opened.callback(self._runner.close)
             opened.callback(self._pool.shutdown, wait=True, cancel_futures=True)
             opened.callback(self._stop_all.set)
@@ -62,7 +69,7 @@ class StageRunner:
     @property
     def parallel_tasks(self) -> int:
         """Maximum number of tasks of this job that are requested at the same time."""
-        at_once = self._cameras if self._settings.executor is not None else self._settings.threads
+        at_once = self._cameras if self.settings.executor is not None else self.settings.threads
         return max(1, min(at_once, self._cameras))
 
     def threads_per_camera(self) -> list[int]:
@@ -71,11 +78,11 @@ class StageRunner:
         The tasks run in groups of `parallel_tasks`. The last group may be smaller; its tasks share all
         threads.
         """
-        if self._settings.executor is not None:
-            return [self._settings.threads] * self._cameras
+        if self.settings.executor is not None:
+            return [self.settings.threads] * self._cameras
         last = self._cameras % self.parallel_tasks or self.parallel_tasks
-        first = [max(1, self._settings.threads // self.parallel_tasks)] * (self._cameras - last)
-        return first + [max(1, self._settings.threads // last)] * last
+        first = [max(1, self.settings.threads // self.parallel_tasks)] * (self._cameras - last)
+        return first + [max(1, self.settings.threads // last)] * last
 
     def expect_frames(self, frames: int, large_frames: int) -> None:
         """Set the numbers of frames of the job, from which the required disk space is estimated.
@@ -98,10 +105,10 @@ class StageRunner:
             BodycapError: The task failed. `NotStored`: the artefact is missing and nothing may be computed.
         """
         try:
-            artefact, computed = self._runner.run(replace(task, priority=self._settings.priority), preload)
+            artefact, computed = self._runner.run(replace(task, priority=self.settings.priority), preload)
         except Cancelled:
             # The task may have stored its artefact before it was stopped.
-            if (stored := self._settings.store.find(task.key)) is not None:
+            if (stored := self.settings.store.find(task.key)) is not None:
                 self._references.add(stored.path)
             raise
         self._references.add(artefact.path)
@@ -115,7 +122,7 @@ class StageRunner:
                 seconds=float(artefact.made["seconds"]),
                 cpu_seconds=artefact.made.get("cpu_seconds"),
                 peak_memory_mb=float(artefact.made["peak_memory_mb"]),
-                artefact=artefact.path.relative_to(self._settings.store.root).as_posix(),
+                artefact=artefact.path.relative_to(self.settings.store.root).as_posix(),
                 acted=artefact.made.get("acted", {}),
             )
         )
@@ -137,10 +144,10 @@ class StageRunner:
         """
         ordered = list(tasks)
         futures = [self._pool.submit(self.run, task) for task in ordered]
-        wait(futures, return_when=FIRST_EXCEPTION if self._settings.compute else ALL_COMPLETED)
+        wait(futures, return_when=FIRST_EXCEPTION if self.settings.compute else ALL_COMPLETED)
         failures = [error for future in futures if future.done() and (error := future.exception())]
         if missing := [error for error in failures if isinstance(error, NotStored)]:
-            raise NotStored([task for error in missing for task in error.tasks], self._settings.store.root)
+            raise NotStored([task for error in missing for task in error.tasks], self.settings.store.root)
         if failures:
             self._stop(futures)
             raise next((error for error in failures if not isinstance(error, Cancelled)), failures[0])
@@ -159,7 +166,7 @@ class StageRunner:
         """Send a note to the listener; a note that was sent before is not repeated."""
         if text not in self._noted:
             self._noted.add(text)
-            self._settings.listener(Event(kind="note", stage=stage, what=f"note: {text}"))
+            self.settings.listener(Event(kind="note", stage=stage, what=f"note: {text}"))
 
     def _require_room(self, task: Task) -> None:
         """Refuse to start a task if the disk space has become too small since the job's check."""

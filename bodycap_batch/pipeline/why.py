@@ -11,14 +11,16 @@ from typing import Any
 
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.progress import task_label
-from bodycap_batch.pipeline.flow import Flow
 from bodycap_batch.pipeline.inputs import has_body
+from bodycap_batch.pipeline.job_facts import JobFacts
 from bodycap_batch.pipeline.run import run_stages
 from bodycap_batch.pipeline.settings import Settings
 from bodycap_batch.pipeline.stage_results import StageResults
+from bodycap_batch.pipeline.stage_runner import StageRunner
 from bodycap_batch.runner import NotStored, Task
 from bodycap_batch.store.artefacts import MANIFEST, Artefact, Store
-from bodycap_batch.tasks.order import BESIDE_KEYFRAMES, STAGE_ORDER
+from bodycap_batch.tasks.order import STAGE_ORDER
+from bodycap_batch.tasks.stages import STAGES
 
 _INPUTS = {
     "capture": "the video, the calibration, start_s or end_s of {}",
@@ -72,15 +74,15 @@ def explain_job(job: Job, *, out_dir: Path, settings: Settings) -> list[Step]:
         BodycapError: The job's files cannot be read, or the disk fails.
     """
     missing: tuple[Task, ...] = ()
-    results = StageResults()
-    with Flow(job, replace(settings, compute=False), logs=out_dir / "logs") as flow:
+    results = StageResults(facts=JobFacts.of(job))
+    with StageRunner.of(job, replace(settings, compute=False), out_dir) as runner:
         try:
-            for _ in run_stages(job, flow, results):
+            for _ in run_stages(runner, results):
                 pass
         except NotStored as error:
-            beside = [*_missing(flow.sound), *_missing(results.preview)]
+            beside = [*_missing(results.sound), *_missing(results.preview)]
             missing = (*error.tasks, *(task for task in beside if task not in error.tasks))
-        records = tuple(flow.runner.records)
+        records = tuple(runner.records)
     steps = [
         Step(stage=task_label(item.stage, item.camera, item.round), stored=True)
         for item in sorted(records, key=lambda item: (item.round, _position(item.stage)))
@@ -115,14 +117,10 @@ def _depends_on(stage: str, first: str, job: Job) -> bool:
 
 
 def _position(stage: str) -> int:
-    """Return the position of a stage in `STAGE_ORDER`.
-
-    Of the stages that are not in `STAGE_ORDER`, those beside the keyframes have the position of the
-    keyframes. The others follow the registration and have the position of the registration.
-    """
-    if stage not in STAGE_ORDER:
-        stage = "keyframes" if stage in BESIDE_KEYFRAMES else "registration"
-    return STAGE_ORDER.index(stage)
+    """Return the position in `STAGE_ORDER` of a stage, or of the stage of which it is a part."""
+    step = STAGES[stage].step
+    assert step is not None
+    return STAGE_ORDER.index(step)
 
 
 def _reason(task: Task, store: Store) -> str:

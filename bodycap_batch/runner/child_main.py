@@ -169,6 +169,7 @@ def _run(task: Task, store: Store, function: TaskFunction, parent: _Parent) -> N
             progress=progress,
             cancelled=parent.orders.closed.is_set,
         )
+        context.check_cancelled()
         function(task.arguments, context, draft.files)
         progress.complete()
         made = {

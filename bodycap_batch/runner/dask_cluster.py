@@ -23,7 +23,6 @@ from bodycap_batch.runner import CHILD_COMMAND, Task, TaskEnvironment
 from bodycap_batch.runner.child_pool import stopped
 from bodycap_batch.runner.child_process import POLL_S
 from bodycap_batch.runner.remote import remote_order, run_order
-from bodycap_batch.runner.turns import Turns
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -60,7 +59,6 @@ class Cluster:
         self._topic = f"bodycap-{uuid.uuid4().hex}"
         self._progress: dict[str, Callable[[int, int, str], None]] = {}
         self._lock = threading.Lock()
-        self._turns = Turns()
         with _lost_connection():
             self._client.subscribe_topic(self._topic, self._receive_progress)
             self._client.run_on_scheduler(_allow_failures, _ALLOWED_FAILURES)
@@ -84,11 +82,6 @@ class Cluster:
         Raises:
             BodycapError: The task failed, or the scheduler was lost; `Cancelled` if the task was stopped.
         """
-        with self._turns.taken(task, environment) as is_stored:
-            if not is_stored:
-                self._submit(task, environment)
-
-    def _submit(self, task: Task, environment: TaskEnvironment) -> None:
         key = f"{task.file_stem}-{uuid.uuid4().hex}"
         with self._lock:
             self._progress[key] = environment.progress

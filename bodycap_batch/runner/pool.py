@@ -17,7 +17,6 @@ from bodycap_batch.runner.child_pool import NOTHING_TO_LOAD, Children, TaskEnvir
 from bodycap_batch.runner.child_process import CHILD_COMMAND, POLL_S
 from bodycap_batch.runner.memory_limit import default_limit_mb
 from bodycap_batch.runner.task import Task
-from bodycap_batch.runner.turns import Turns
 
 
 class Slots:
@@ -87,19 +86,12 @@ class LocalPool:
         self.slots = Slots(cores, memory_mb or default_limit_mb())
         self._children = Children(command)
         self._logs: set[Path] = set()
-        self._turns = Turns()
 
     def execute(self, task: Task, environment: TaskEnvironment) -> None:
-        """Wait for cores and memory; compute and commit the task's artefact. Raises `BodycapError`.
-
-        Nothing is computed if the artefact is stored already.
-        """
-        with self._turns.taken(task, environment) as is_stored:
-            if is_stored:
-                return
-            with self.slots.taken(task, environment.cancelled):
-                self._logs.add(environment.logs)
-                self._children.execute(task, replace(environment, preload=NOTHING_TO_LOAD))
+        """Wait for cores and memory; compute and commit the task's artefact. Raises `BodycapError`."""
+        with self.slots.taken(task, environment.cancelled):
+            self._logs.add(environment.logs)
+            self._children.execute(task, replace(environment, preload=NOTHING_TO_LOAD))
 
     def close(self, logs: Path) -> None:
         """Do nothing: the child processes are kept for other jobs."""

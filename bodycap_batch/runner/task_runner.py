@@ -11,6 +11,7 @@ from bodycap_batch.core.errors import BodycapError, Cancelled, StoreError
 from bodycap_batch.core.progress import Event, Listener
 from bodycap_batch.runner.child_pool import NOTHING_TO_LOAD, Executor, Preload, TaskEnvironment
 from bodycap_batch.runner.task import Task
+from bodycap_batch.runner.turns import turn
 from bodycap_batch.store.artefacts import Artefact, Store
 
 _HINT = (
@@ -124,7 +125,10 @@ class Runner:
             preload=preload,
             memory_mb=self._rules.memory_mb,
         )
-        self._executor.execute(replace(task, replaces=task.key.stage in self._rules.redo), environment)
+        task = replace(task, replaces=task.key.stage in self._rules.redo)
+        with turn(task, environment) as is_stored:
+            if not is_stored:
+                self._executor.execute(task, environment)
         if (artefact := self.store.find(task.key)) is None:
             raise StoreError(
                 f"{task.label}: the stored result of this stage is missing",

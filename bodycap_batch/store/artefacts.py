@@ -29,7 +29,6 @@ from bodycap_batch.store.digests import (
     file_sha256,
     json_digest,
     remove_abandoned,
-    set_digest,
     write_atomically,
 )
 
@@ -385,7 +384,7 @@ def _as_json(value: Any) -> Any:
 
 
 def _content_digest(files: Mapping[str, str]) -> str:
-    return set_digest({name: sha for name, sha in files.items() if not name.endswith(_VOLATILE_SUFFIXES)})
+    return json_digest({name: sha for name, sha in files.items() if not name.endswith(_VOLATILE_SUFFIXES)})
 
 
 def _sync_files(folder: Path) -> dict[str, str]:

@@ -8,7 +8,7 @@ import os
 import platform
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +31,6 @@ def json_digest(value: Any) -> str:
     """Return the SHA-256 of a JSON value in its canonical form (sorted keys, no spaces)."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def set_digest(files: Mapping[str, str]) -> str:
-    """Return the SHA-256 of a set of files. The argument holds the digest of each file, by file name."""
-    return json_digest(dict(sorted(files.items())))
 
 
 def file_sha256(path: Path, on_bytes: Callable[[int], None] | None = None) -> str:

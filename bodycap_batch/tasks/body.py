@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from bodycap_batch.formats.bvh import RigOptions, read_rig
+from bodycap_batch.model.nominal_mounts import STATED_SIGMA_M, STATED_SIGMA_RAD, camera_reach, nominal_mount
+from bodycap_batch.model.skeleton import Mount, SkeletonModel, with_tpose_as_zero_pose, without_outer_joints
+from bodycap_batch.model.skeleton_presets import load_skeleton
 from bodycap_batch.tasks.inputs import BodyInput, MountInput
-
-if TYPE_CHECKING:
-    from bodycap_batch.model.skeleton import Mount, SkeletonModel
 
 
 def load_body(body: BodyInput) -> tuple[SkeletonModel, tuple[Mount, ...]]:
@@ -23,8 +25,6 @@ def camera_distances(body: BodyInput) -> list[tuple[str, str, float, float]]:
     Returns:
         Rows (first camera, second camera, smallest distance, largest distance), in metres.
     """
-    from bodycap_batch.model.nominal_mounts import camera_reach
-
     # The map's scale is unknown, so mapping uses only the ratios of these distances. The stature is removed,
     # so that the map stays the same if the user adds the stature to the job later.
     return camera_reach(*load_body(replace(body, height_m=None)))
@@ -36,11 +36,6 @@ def mount_prior(mount: MountInput, skeleton: SkeletonModel) -> Mount:
     A pose given in the job replaces the nominal pose of the named place. Standard deviations given in the job
     replace the defaults. The defaults for a given pose differ from the defaults for a nominal pose.
     """
-    import numpy as np
-
-    from bodycap_batch.model.nominal_mounts import STATED_SIGMA_M, STATED_SIGMA_RAD, nominal_mount
-    from bodycap_batch.model.skeleton import Mount
-
     nominal = nominal_mount(mount.place, mount.role, skeleton)
     pose, sigma_deg, sigma_m = mount.joint_from_cam, mount.sigma_deg, mount.sigma_m
     default = (nominal.sigma_rad, nominal.sigma_m) if pose is None else (STATED_SIGMA_RAD, STATED_SIGMA_M)
@@ -56,13 +51,9 @@ def mount_prior(mount: MountInput, skeleton: SkeletonModel) -> Mount:
 
 def _load_skeleton(body: BodyInput) -> SkeletonModel:
     if body.skeleton_file is not None:
-        from bodycap_batch.formats.bvh import RigOptions, read_rig
-        from bodycap_batch.model.skeleton import with_tpose_as_zero_pose, without_outer_joints
-
         rig = RigOptions(roles=body.skeleton_map, tpose_frame=body.tpose_frame, height_m=body.height_m)
         skeleton, _ = read_rig(body.skeleton_file.path, rig)
         return without_outer_joints(with_tpose_as_zero_pose(skeleton))
-    from bodycap_batch.model.skeleton_presets import load_skeleton
 
     assert body.skeleton is not None
     return load_skeleton(body.skeleton, body.height_m)

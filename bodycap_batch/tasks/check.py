@@ -10,7 +10,7 @@ from bodycap_batch.config.limits import Limits
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import BodyInput, StatedClock
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
+from bodycap_batch.tasks.stage import write_summary
 from bodycap_batch.tasks.typed_json import omitted_from_key
 
 
@@ -43,7 +43,6 @@ def run_check(task: CheckTask, context: StageContext, files: Path) -> None:
     from bodycap_batch.check import require_ready, require_within_limits
     from bodycap_batch.telemetry.gopro import has_telemetry_track, states_stabilisation
 
-    context.check_cancelled()
     if task.limits is not None:
         require_within_limits(task.job, task.limits)
     report = require_ready(task.job, context.threads)
@@ -57,12 +56,3 @@ def run_check(task: CheckTask, context: StageContext, files: Path) -> None:
     write_summary(
         files, notes=notes, frames=frames, large_frames=large, telemetry=telemetry, stabilised=stabilised
     )
-
-
-CHECK = Stage(
-    name="check",
-    task=CheckTask,
-    function=run_check,
-    libraries=VISION_LIBRARIES,
-    modules=(*VISION_MODULES, "bodycap_batch.check", "bodycap_batch.telemetry.gopro"),
-)

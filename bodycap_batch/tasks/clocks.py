@@ -7,27 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.formats.dataclass_files import write_dataclass
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, StatedClock
 from bodycap_batch.tasks.loading import CLOCKS_NAME, load_map, load_registration
 from bodycap_batch.tasks.sound import load_sound
-from bodycap_batch.tasks.stage import Stage, write_summary
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CameraDistance:
-    """The smallest and largest distance that the body permits between two cameras.
-
-    Attributes:
-        first: Name of the first camera.
-        second: Name of the second camera.
-        least_m: Smallest distance (metres), for a body of the skeleton's nominal size.
-        most_m: Largest distance (metres), for a body of the skeleton's nominal size.
-    """
-
-    first: str
-    second: str
-    least_m: float
-    most_m: float
+from bodycap_batch.tasks.stage import write_summary
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +26,8 @@ class ClocksTask:
         sound: What the sound says; None if there is only one camera.
         map: The map.
         registrations: The registration of each camera, by camera name.
-        reach: Distances between cameras that the body permits.
+        reach: Rows of names of two cameras, and smallest and largest distance (metres) that the body permits
+            between them, for a body of the skeleton's nominal size.
     """
 
     capture: CaptureRef
@@ -52,10 +37,10 @@ class ClocksTask:
     sound: ArtefactRef | None
     map: ArtefactRef
     registrations: Mapping[str, ArtefactRef]
-    reach: tuple[CameraDistance, ...]
+    reach: tuple[tuple[str, str, float, float], ...]
 
 
-def run_clocks(task: ClocksTask, context: StageContext, files: Path) -> None:
+def run_clocks(task: ClocksTask, _: StageContext, files: Path) -> None:
     """Decide which clock each camera has, and store the clocks."""
     from bodycap_batch.clocks import (
         add_motion,
@@ -65,10 +50,8 @@ def run_clocks(task: ClocksTask, context: StageContext, files: Path) -> None:
         decide_clocks,
         stated_offsets,
     )
-    from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.mapping.validation.camera_distance_check import check_distances
 
-    context.check_cancelled()
     capture = task.capture.config
     evidence = load_sound(None if task.sound is None else task.sound.path)
     paths = [load_registration(artefact.path).trajectory for artefact in task.registrations.values()]
@@ -80,7 +63,7 @@ def run_clocks(task: ClocksTask, context: StageContext, files: Path) -> None:
         estimates = add_motion(estimates, motion, evidence, stated_s)
     clocks = decide_clocks(capture, estimates)
     write_dataclass(clocks, files, CLOCKS_NAME)
-    reach = {(pair.first, pair.second): (pair.least_m, pair.most_m) for pair in task.reach}
+    reach = {(first, second): (least_m, most_m) for first, second, least_m, most_m in task.reach}
     distances = None
     if reach:
         times_ns = {path.camera: path.times_ns for path in paths}
@@ -89,12 +72,3 @@ def run_clocks(task: ClocksTask, context: StageContext, files: Path) -> None:
         distances = check_distances(load_map(task.map.path).maps[0], common_ns, reach).to_log()
     unknown = [name for name, clock in clocks.cameras.items() if not clock.is_known]
     write_summary(files, notes=clock_notes(clocks), distances=distances, unknown=unknown)
-
-
-CLOCKS = Stage(
-    name="clocks",
-    task=ClocksTask,
-    function=run_clocks,
-    libraries=("numpy", "scipy"),
-    modules=("bodycap_batch.clocks", "bodycap_batch.mapping.validation.camera_distance_check"),
-)

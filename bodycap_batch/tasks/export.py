@@ -8,17 +8,20 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bodycap_batch.capture.timeline import join_chapters
 from bodycap_batch.config.options import ExportOptions
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.model.scene import MapResult
+from bodycap_batch.model.take import Timecode, exact_rate
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_clocks, load_keyframes, load_map
+from bodycap_batch.tasks.motion import load_motion
 from bodycap_batch.tasks.registered_cameras import RegisteredCameras
-from bodycap_batch.tasks.stage import RESULTS_FOLDER, Stage, read_summary, write_summary
+from bodycap_batch.tasks.stage import RESULTS_FOLDER, read_summary, write_summary
 from bodycap_batch.tasks.typed_json import omitted_from_key
 
 if TYPE_CHECKING:
     from bodycap_batch.export.export_inputs import VideoFacts
-    from bodycap_batch.model.scene import MapResult
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,14 +61,12 @@ class ExportTask:
 def run_export(task: ExportTask, context: StageContext, files: Path) -> None:
     """Write the result files; the notes in the summary say which parts are empty and left out."""
     from bodycap_batch.export import LEFT_OUT, ExportInputs, export_results
-    from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.model.merge_data import MergeResult
 
     scene = load_map(task.map.path)
     paths = paths_of(task.registrations.values())
-    clocks = load_clocks(task.clocks)
+    clocks = load_clocks(task.clocks.path)
     found = RegisteredCameras.load(paths, scene.maps, clocks)
-    merge = None if task.merge is None else read_dataclass(MergeResult, task.merge.path, "merge")
+    merge = None if task.merge is None else load_motion(task.merge)
     inputs = ExportInputs(
         out_dir=files / RESULTS_FOLDER,
         maps=scene.maps,
@@ -112,10 +113,8 @@ def log_of(scene: MapResult, freed: Mapping[str, float]) -> Mapping[str, Any]:
 
 def _video_facts(capture: CaptureRef) -> dict[str, VideoFacts]:
     """Return what the files for 3D programs state about the video of each camera."""
-    from bodycap_batch.capture.timeline import join_chapters
     from bodycap_batch.clocks.container_times import read_timecode
     from bodycap_batch.export.export_inputs import VideoFacts
-    from bodycap_batch.model.take import Timecode, exact_rate
 
     facts = {}
     sidecars = {camera.name: camera.timestamps for camera in capture.config.cameras}
@@ -130,18 +129,3 @@ def _video_facts(capture: CaptureRef) -> dict[str, VideoFacts]:
             first_frame_ns=int(times_ns[0]),
         )
     return facts
-
-
-EXPORT = Stage(
-    name="export",
-    task=ExportTask,
-    function=run_export,
-    libraries=("numpy", "scipy", "open3d-cpu|open3d", "pygltflib", "usd-core", "ezc3d"),
-    modules=(
-        "bodycap_batch.export",
-        "bodycap_batch.formats.open3d_preload",
-        "pycolmap",
-        "pygltflib",
-        "scipy.spatial.transform",
-    ),
-)

@@ -6,14 +6,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.formats.dataclass_files import write_dataclass
 from bodycap_batch.model.fill_data import FillMode
+from bodycap_batch.model.merge_data import MergeResult
 from bodycap_batch.tasks.inputs import ArtefactRef
-from bodycap_batch.tasks.stage import Stage, write_summary
+from bodycap_batch.tasks.motion import MOTION_NAME, load_motion
+from bodycap_batch.tasks.stage import write_summary
 
 if TYPE_CHECKING:
     from bodycap_batch.fill.standing_height import HeightSigmas
-    from bodycap_batch.model.merge_data import MergeResult
 
 _MEASURED_FLOORS = ("map", "feet")
 """Names of the methods of merging that measure the height of the floor. Other methods assume it."""
@@ -41,10 +45,8 @@ class FillTask:
 def run_fill(task: FillTask, context: StageContext, files: Path) -> None:
     """Pose the joints and store the motion."""
     from bodycap_batch.fill import fill_motion
-    from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
-    from bodycap_batch.model.merge_data import MergeResult
 
-    merged = read_dataclass(MergeResult, task.merge.path, "merge")
+    merged = load_motion(task.merge)
     filled = fill_motion(
         merged.motion,
         merged.solved,
@@ -52,7 +54,7 @@ def run_fill(task: FillTask, context: StageContext, files: Path) -> None:
         mode=task.mode,
         context=context,
     )
-    write_dataclass(replace(merged, motion=filled.motion, fill=filled.report), files, "merge")
+    write_dataclass(replace(merged, motion=filled.motion, fill=filled.report), files, MOTION_NAME)
     write_summary(files, filled=int(filled.report.filled.sum()))
 
 
@@ -63,8 +65,6 @@ def _heights(merged: MergeResult) -> HeightSigmas:
     the bones are scaled from the stature, the pelvis takes up the error. Bones that were measured keep their
     lengths, so that the floor takes it up.
     """
-    import numpy as np
-
     from bodycap_batch.fill.standing_height import HeightSigmas
 
     scale = merged.report.scale
@@ -75,12 +75,3 @@ def _heights(merged: MergeResult) -> HeightSigmas:
     if any(source.name == "skeleton" for source in scale.sources):
         return HeightSigmas(float(np.hypot(floor_m, trunk_m)), 0.0)
     return HeightSigmas(floor_m, trunk_m)
-
-
-FILL = Stage(
-    name="fill",
-    task=FillTask,
-    function=run_fill,
-    libraries=("numpy", "scipy"),
-    modules=("bodycap_batch.fill", "scipy.signal", "scipy.spatial.transform"),
-)

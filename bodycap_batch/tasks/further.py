@@ -8,12 +8,13 @@ from pathlib import Path
 
 from bodycap_batch.config.options import MapOptions, RegistrationOptions
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.mechanisms import Mechanism, record_act
+from bodycap_batch.formats.dataclass_files import write_dataclass
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
-from bodycap_batch.tasks.mapping import MAP_MEMORY_MB, save_map
+from bodycap_batch.tasks.mapping import save_map
 from bodycap_batch.tasks.registered_cameras import OTHER_PATHS, replace_registration
 from bodycap_batch.tasks.registration import NOT_ROUNDS
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +57,6 @@ class FurtherPosesTask:
 
 def run_further_maps(task: FurtherMapsTask, context: StageContext, files: Path) -> None:
     """Build the further maps; store them with the maps to which the paths refer."""
-    from bodycap_batch.core.mechanisms import Mechanism, record_act
     from bodycap_batch.mapping import map_lost_keyframes
 
     previous = load_map(task.map.path)
@@ -70,7 +70,6 @@ def run_further_maps(task: FurtherMapsTask, context: StageContext, files: Path) 
 
 def run_further_poses(task: FurtherPosesTask, context: StageContext, files: Path) -> None:
     """Store the camera's registration, and the poses of its lost frames in further maps."""
-    from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.registration import localise_in_other_maps
 
     camera = load_capture(task.capture, task.keyframes, threads=context.threads).cameras[0]
@@ -81,20 +80,3 @@ def run_further_poses(task: FurtherPosesTask, context: StageContext, files: Path
     )
     replace_registration(found, before, files)
     write_dataclass(paths, files, OTHER_PATHS)
-
-
-FURTHER_MAPS = Stage(
-    name="further_maps",
-    task=FurtherMapsTask,
-    function=run_further_maps,
-    libraries=(*VISION_LIBRARIES, "pycolmap"),
-    modules=(*VISION_MODULES, "pycolmap", "bodycap_batch.mapping"),
-    memory_mb=MAP_MEMORY_MB,
-)
-FURTHER_POSES = Stage(
-    name="further_poses",
-    task=FurtherPosesTask,
-    function=run_further_poses,
-    libraries=(*VISION_LIBRARIES, "pycolmap"),
-    modules=(*VISION_MODULES, "pycolmap", "bodycap_batch.registration"),
-)

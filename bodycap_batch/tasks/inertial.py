@@ -7,17 +7,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bodycap_batch.capture import open_capture
 from bodycap_batch.config.options import TelemetryOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
+from bodycap_batch.model.camera_clock import FrameTiming
+from bodycap_batch.model.scene import Trajectory
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, FileRef
 from bodycap_batch.tasks.loading import load_registration
 from bodycap_batch.tasks.registered_cameras import INERTIAL_CAMERA
 from bodycap_batch.tasks.registration import save_registration
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
 
 if TYPE_CHECKING:
-    from bodycap_batch.model.scene import Trajectory
     from bodycap_batch.telemetry.streams import CameraTelemetry
 
 
@@ -46,14 +48,10 @@ class InertialTask:
 
 def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None:
     """Use the sensor of the camera, and store the registration together with the result."""
-    from bodycap_batch.capture import open_capture
-    from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
     from bodycap_batch.inertial import use_sensor
-    from bodycap_batch.model.camera_clock import FrameTiming
     from bodycap_batch.telemetry import read_telemetry
     from bodycap_batch.telemetry.comparison import all_times_ns
 
-    context.check_cancelled()
     capture, configs = open_capture(task.capture.config, context.threads), task.capture.config.cameras
     camera = capture.cameras[0]
     times_ns = all_times_ns(camera, configs[0])
@@ -87,12 +85,3 @@ def run_inertial(task: InertialTask, context: StageContext, files: Path) -> None
     camera = replace(camera, nominal_fps=read_dataclass(FrameTiming, before, "timing").nominal_fps)
     save_registration(registration, camera, files, notes=notes)
     write_dataclass(found.camera, files, INERTIAL_CAMERA)
-
-
-INERTIAL = Stage(
-    name="inertial",
-    task=InertialTask,
-    function=run_inertial,
-    libraries=(*VISION_LIBRARIES, "scipy"),
-    modules=(*VISION_MODULES, "bodycap_batch.inertial", "scipy.optimize", "scipy.interpolate"),
-)

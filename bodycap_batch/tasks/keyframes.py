@@ -6,18 +6,28 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from bodycap_batch.capture import CaptureCamera
+from bodycap_batch.capture.damage import damage_notes
+from bodycap_batch.capture.kept import KEPT_NAME, FrameKeeper
+from bodycap_batch.capture.masks import without_regions
 from bodycap_batch.config.options import KeyframeOptions
+from bodycap_batch.core.arrays import BoolArray, IntArray
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
+from bodycap_batch.formats.dataclass_files import write_dataclass
+from bodycap_batch.model.copied_frames import copied_notes
+from bodycap_batch.model.frozen_frames import frozen_notes
+from bodycap_batch.model.lens_estimate import LensEstimate
+from bodycap_batch.model.point_tracks import STORED_STEP, PointTracks
+from bodycap_batch.model.rotation_chain import RotationChain
 from bodycap_batch.tasks.inputs import CaptureRef, FileRef
 from bodycap_batch.tasks.loading import TRACKS, load_capture
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
+from bodycap_batch.tasks.stage import write_summary
 
 if TYPE_CHECKING:
-    from bodycap_batch.capture import CaptureCamera
-    from bodycap_batch.core.arrays import BoolArray, IntArray
-    from bodycap_batch.model.lens_estimate import LensEstimate
-    from bodycap_batch.model.point_tracks import PointTracks
-    from bodycap_batch.model.rotation_chain import RotationChain
     from bodycap_batch.telemetry.streams import CameraTelemetry
 
 
@@ -48,16 +58,7 @@ class KeyframesTask:
 
 def run_keyframes(task: KeyframesTask, context: StageContext, files: Path) -> None:
     """Select the keyframes; store them with copies of decoded frames and notes for the user."""
-    import numpy as np
-
-    from bodycap_batch.capture.damage import damage_notes
-    from bodycap_batch.capture.kept import KEPT_NAME, FrameKeeper
-    from bodycap_batch.capture.masks import without_regions
-    from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.keyframes import select_keyframes
-    from bodycap_batch.model.copied_frames import copied_notes
-    from bodycap_batch.model.frozen_frames import frozen_notes
-    from bodycap_batch.model.point_tracks import STORED_STEP
     from bodycap_batch.telemetry.camera_rates import relate_gyro
     from bodycap_batch.tracks import fixed_notes
 
@@ -117,9 +118,6 @@ class TrackFindings:
 
 def regions_and_lens(camera: CaptureCamera, context: StageContext) -> TrackFindings:
     """Return what the tracks of a video show. A video of fewer than two frames shows nothing."""
-    import numpy as np
-
-    from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
     from bodycap_batch.tracks import (
         estimate_lens,
         find_fixed_regions,
@@ -165,7 +163,6 @@ def regions_and_lens(camera: CaptureCamera, context: StageContext) -> TrackFindi
 
 def _rotation_chain(camera: CaptureCamera, shown: TrackFindings, frames: IntArray) -> RotationChain | None:
     """Return how the camera turns; None if its lens or its tracks are unknown."""
-    from bodycap_batch.core.mechanisms import Mechanism, is_on
     from bodycap_batch.tracks import measure_rotation_chain
 
     known = not camera.camera.refine or (shown.lens is not None and shown.lens.is_determined)
@@ -177,7 +174,6 @@ def _rotation_chain(camera: CaptureCamera, shown: TrackFindings, frames: IntArra
 
 def _telemetry(camera: CaptureCamera, task: KeyframesTask) -> tuple[CameraTelemetry | None, list[str]]:
     """Return the telemetry of the camera if it is used, and notes for the user."""
-    from bodycap_batch.core.errors import CaptureError
     from bodycap_batch.telemetry import read_telemetry
     from bodycap_batch.telemetry.comparison import all_times_ns
 
@@ -188,12 +184,3 @@ def _telemetry(camera: CaptureCamera, task: KeyframesTask) -> tuple[CameraTeleme
         return read_telemetry(camera.videos, all_times_ns(camera, config), config.samples), []
     except CaptureError as error:
         return None, [f"{camera.name}: {error.one_line}; its samples are not used"]
-
-
-KEYFRAMES = Stage(
-    name="keyframes",
-    task=KeyframesTask,
-    function=run_keyframes,
-    libraries=VISION_LIBRARIES,
-    modules=(*VISION_MODULES, "bodycap_batch.keyframes", "pycolmap"),
-)

@@ -6,10 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.formats.dataclass_files import read_dataclass
+from bodycap_batch.model.path_uncertainty import path_uncertainty
+from bodycap_batch.model.point_tracks import PointTracks
+from bodycap_batch.model.scene import OtherPaths
 from bodycap_batch.tasks.inputs import ArtefactRef
 from bodycap_batch.tasks.loading import TRACKS, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.registered_cameras import OTHER_PATHS
-from bodycap_batch.tasks.stage import Stage, write_summary
+from bodycap_batch.tasks.stage import write_summary
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,10 +34,6 @@ class LinksTask:
 def run_links(task: LinksTask, context: StageContext, files: Path) -> None:
     """Store how many frames of each path the tracks confirm and contradict, and how certain the path is."""
     from bodycap_batch.evaluate.track_check import TrackedVideo, check_with_tracks, count_frames
-    from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.model.path_uncertainty import path_uncertainty
-    from bodycap_batch.model.point_tracks import PointTracks
-    from bodycap_batch.model.scene import OtherPaths
 
     registration = task.registration.path
     path = load_registration(registration).trajectory
@@ -72,12 +72,3 @@ def run_links(task: LinksTask, context: StageContext, files: Path) -> None:
         compared = check_with_tracks(video, path.gauge_from_cam, show)
         links.append({"frame": path.gauge, **count_frames(compared)})
     write_summary(files, links=links, **found)
-
-
-LINKS = Stage(
-    name="links",
-    task=LinksTask,
-    function=run_links,
-    libraries=("numpy", "scipy", "opencv-python-headless|opencv-python", "pycolmap"),
-    modules=("bodycap_batch.evaluate.track_check",),
-)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from bodycap_batch.capture import Capture, open_capture
+from bodycap_batch.capture.kept import KEPT_NAME, KeptFrames
+from bodycap_batch.capture.masks import without_regions
+from bodycap_batch.formats.dataclass_files import read_dataclass
+from bodycap_batch.model.camera_clock import CaptureClocks
+from bodycap_batch.model.scene import KeyframeSelection, MapResult, Registration
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
-
-if TYPE_CHECKING:
-    from bodycap_batch.capture import Capture, KeptFrames
-    from bodycap_batch.model.camera_clock import CaptureClocks
-    from bodycap_batch.model.scene import KeyframeSelection, MapResult, Registration
 
 CLOCKS_NAME = "clocks"
 """Name of the file, without suffix, that holds the clocks of a capture."""
@@ -39,9 +39,6 @@ def load_capture(
         clocks: The clocks of all cameras; None for a task that does not relate times of different cameras.
         threads: Number of threads of each video decoder; 0 lets the decoder choose.
     """
-    from bodycap_batch.capture import open_capture
-    from bodycap_batch.capture.masks import without_regions
-
     opened = open_capture(capture.config, threads)
     stored = keyframes or {}
     cameras = []
@@ -63,8 +60,6 @@ def load_capture(
 
 
 def _kept_frames(keyframes: ArtefactRef | None) -> KeptFrames | None:
-    from bodycap_batch.capture.kept import KEPT_NAME, KeptFrames
-    from bodycap_batch.formats.dataclass_files import read_dataclass
 
     if keyframes is None or not (keyframes.path / f"{KEPT_NAME}.json").exists():
         return None
@@ -73,31 +68,19 @@ def _kept_frames(keyframes: ArtefactRef | None) -> KeptFrames | None:
 
 def load_keyframes(path: Path) -> KeyframeSelection:
     """Read the selected keyframes of a camera from an artefact's folder."""
-    from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.model.scene import KeyframeSelection
-
     return read_dataclass(KeyframeSelection, path, "keyframes")
 
 
 def load_map(path: Path) -> MapResult:
     """Read a map and the path of its workspace from an artefact's folder."""
-    from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.model.scene import MapResult
-
     return read_dataclass(MapResult, path, "map")
 
 
-def load_clocks(artefact: ArtefactRef) -> CaptureClocks:
-    """Read the clocks of all cameras from an artefact."""
-    from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.model.camera_clock import CaptureClocks
-
-    return read_dataclass(CaptureClocks, artefact.path, CLOCKS_NAME)
+def load_clocks(path: Path) -> CaptureClocks:
+    """Read the clocks of all cameras from an artefact's folder."""
+    return read_dataclass(CaptureClocks, path, CLOCKS_NAME)
 
 
 def load_registration(path: Path) -> Registration:
     """Read the poses and observations of a camera from an artefact's folder."""
-    from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.model.scene import Registration
-
     return read_dataclass(Registration, path, "registration")

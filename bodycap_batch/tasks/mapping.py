@@ -7,16 +7,17 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from bodycap_batch.config.options import MapOptions
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import NO_MOTION_HINT, EstimationError
+from bodycap_batch.formats.dataclass_files import write_dataclass
+from bodycap_batch.model.scene import MapResult
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
-
-if TYPE_CHECKING:
-    from bodycap_batch.model.scene import MapResult
+from bodycap_batch.tasks.stage import write_summary
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +75,6 @@ class RefineTask:
 
 def run_map(task: MapTask, context: StageContext, files: Path) -> None:
     """Build the map and store it."""
-    from bodycap_batch.core.errors import NO_MOTION_HINT, EstimationError
     from bodycap_batch.mapping import build_map, empty_map
 
     selections = [load_keyframes(artefact.path) for artefact in task.keyframes.values()]
@@ -91,8 +91,6 @@ def run_map(task: MapTask, context: StageContext, files: Path) -> None:
 
 def run_extend(task: ExtendTask, context: StageContext, files: Path) -> None:
     """Extend the map and store it."""
-    import numpy as np
-
     from bodycap_batch.mapping import extend_map, with_estimated_lenses
 
     extra = {name: np.asarray(frames, dtype=np.int64) for name, frames in task.extra.items()}
@@ -121,7 +119,6 @@ def save_map(result: MapResult, files: Path) -> None:
         result: The map.
         files: Folder of the artefact.
     """
-    from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.mapping.intrinsics.intrinsics_check import misfit_note
     from bodycap_batch.mapping.matching.flipped_cameras import flip_notes
     from bodycap_batch.mapping.validation.epipolar_consistency import contradicting_camera_note
@@ -149,34 +146,3 @@ def save_map(result: MapResult, files: Path) -> None:
             ),
         ],
     )
-
-
-_LIBRARIES = (*VISION_LIBRARIES, "pycolmap")
-_MODULES = (*VISION_MODULES, "pycolmap", "bodycap_batch.mapping")
-MAP_MEMORY_MB = 1500
-"""Memory to reserve (MB) for a task that builds, extends or refines a map.
-Evidence: docs/decisions/pipeline.md."""
-MAP = Stage(
-    name="map",
-    task=MapTask,
-    function=run_map,
-    libraries=_LIBRARIES,
-    modules=_MODULES,
-    memory_mb=MAP_MEMORY_MB,
-)
-EXTEND = Stage(
-    name="extend",
-    task=ExtendTask,
-    function=run_extend,
-    libraries=_LIBRARIES,
-    modules=_MODULES,
-    memory_mb=MAP_MEMORY_MB,
-)
-REFINE = Stage(
-    name="refine",
-    task=RefineTask,
-    function=run_refine,
-    libraries=_LIBRARIES,
-    modules=_MODULES,
-    memory_mb=MAP_MEMORY_MB,
-)

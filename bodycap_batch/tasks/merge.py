@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from bodycap_batch.config.options import MarkerBoard, MergeOptions
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.core.errors import EstimationError
+from bodycap_batch.formats.dataclass_files import write_dataclass
+from bodycap_batch.model.merge_data import MergeInputs
+from bodycap_batch.model.scene import FrameStatus
 from bodycap_batch.tasks.body import load_body
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_clocks, load_map
+from bodycap_batch.tasks.motion import MOTION_NAME
 from bodycap_batch.tasks.registered_cameras import RegisteredCameras
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, Stage, write_summary
-
-if TYPE_CHECKING:
-    from bodycap_batch.model.merge_data import MergeInputs
+from bodycap_batch.tasks.stage import write_summary
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +59,6 @@ class MergeTask:
 
 def run_merge(task: MergeTask, context: StageContext, files: Path) -> None:
     """Solve the motion and store it."""
-    from bodycap_batch.formats.dataclass_files import write_dataclass
     from bodycap_batch.merging import merge_trajectories
 
     inputs = _merge_inputs(task)
@@ -69,7 +71,7 @@ def run_merge(task: MergeTask, context: StageContext, files: Path) -> None:
 
         add_flip_hint(error, load_map(task.map.path).diagnostics)
         raise
-    write_dataclass(result, files, "merge")
+    write_dataclass(result, files, MOTION_NAME)
     notes = [f"camera {name} is not used for the body: {why}" for name, why in result.unused_cameras.items()]
     notes += [result.report.exchanged_sides.says] if result.report.exchanged_sides is not None else []
     notes += [result.report.inverted_cameras.says] if result.report.inverted_cameras is not None else []
@@ -78,11 +80,10 @@ def run_merge(task: MergeTask, context: StageContext, files: Path) -> None:
 
 
 def _merge_inputs(task: MergeTask) -> MergeInputs:
-    from bodycap_batch.model.merge_data import MergeInputs
 
     scene = load_map(task.map.path)
     found = RegisteredCameras.load(
-        paths_of(task.registrations.values()), scene.maps, load_clocks(task.clocks)
+        paths_of(task.registrations.values()), scene.maps, load_clocks(task.clocks.path)
     )
     skeleton, mounts = load_body(task.body)
     mounted = {mount.camera for mount in mounts}
@@ -108,12 +109,7 @@ def _with_board(
     inputs: MergeInputs, task: MergeTask, footage: BoardFootage, board: MarkerBoard, context: StageContext
 ) -> MergeInputs:
     """Search the keyframes for the marker board, and return the inputs completed with its views."""
-    import dataclasses
-
-    import numpy as np
-
     from bodycap_batch.calibration.board_views import find_board_views
-    from bodycap_batch.model.scene import FrameStatus
 
     frames, lenses = {}, {}
     maps = {item.gauge: item for item in load_map(task.map.path).maps}
@@ -125,12 +121,3 @@ def _with_board(
     capture = load_capture(footage.capture, footage.keyframes, threads=context.threads)
     views = find_board_views(capture, frames, lenses, board, context)
     return dataclasses.replace(inputs, board_views=views)
-
-
-MERGE = Stage(
-    name="merge",
-    task=MergeTask,
-    function=run_merge,
-    libraries=("scipy", "gtsam", *VISION_LIBRARIES),
-    modules=("bodycap_batch.merging.stage", "gtsam", "scipy.optimize", "scipy.spatial.transform"),
-)

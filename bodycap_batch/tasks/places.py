@@ -9,7 +9,7 @@ from pathlib import Path
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef
 from bodycap_batch.tasks.loading import load_clocks, load_registration
-from bodycap_batch.tasks.stage import Stage, write_summary
+from bodycap_batch.tasks.stage import write_summary
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,26 +33,16 @@ class PlacesTask:
     registrations: Mapping[str, ArtefactRef]
 
 
-def run_places(task: PlacesTask, context: StageContext, files: Path) -> None:
+def run_places(task: PlacesTask, _: StageContext, files: Path) -> None:
     """Find the places, and store them in the summary."""
     from bodycap_batch.camera_places import FoundPlaces, find_places_with
 
-    context.check_cancelled()
     paths = [load_registration(artefact.path).trajectory for artefact in task.registrations.values()]
     if len({path.gauge for path in paths}) > 1:
         found = FoundPlaces(by_camera={}, reason="the cameras are not in one map")
     else:
-        clocks = {trunk: load_clocks(artefact).cameras for trunk, artefact in task.clocks.items()}
+        clocks = {trunk: load_clocks(artefact.path).cameras for trunk, artefact in task.clocks.items()}
         found = find_places_with(clocks, paths, task.stated)
     text = ", ".join(f"{name} on {place}" for name, place in found.by_camera.items())
     notes = [f"places found from the motion: {text}"] if text else []
     write_summary(files, places=dict(found.by_camera), reason=found.reason, notes=notes)
-
-
-PLACES = Stage(
-    name="places",
-    task=PlacesTask,
-    function=run_places,
-    libraries=("numpy", "scipy"),
-    modules=("bodycap_batch.camera_places",),
-)

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from bodycap_batch.capture import Capture
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.model.geometry import Similarity
+from bodycap_batch.model.merge_data import MergeResult
+from bodycap_batch.model.scene import Map
+from bodycap_batch.model.skeleton_presets import split_side
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_clocks, load_map, load_registration
+from bodycap_batch.tasks.motion import load_motion
 from bodycap_batch.tasks.registered_cameras import RegisteredCameras
-from bodycap_batch.tasks.stage import RESULTS_FOLDER, VISION_LIBRARIES, VISION_MODULES, Stage
+from bodycap_batch.tasks.stage import RESULTS_FOLDER
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from bodycap_batch.capture import Capture
-    from bodycap_batch.model.geometry import Similarity
-    from bodycap_batch.model.merge_data import MergeResult
-    from bodycap_batch.model.scene import Map
     from bodycap_batch.preview import PreviewInputs
 
 
@@ -54,19 +56,16 @@ def run_preview(task: PreviewTask, context: StageContext, files: Path) -> None:
 
 
 def _preview_inputs(task: PreviewTask, path: Path, threads: int) -> PreviewInputs:
-    import numpy as np
 
-    from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.model.merge_data import MergeResult
     from bodycap_batch.overlay import bones_from_motion, make_camera_views
     from bodycap_batch.preview import PreviewInputs
 
     scene = load_map(task.map.path)
     paths = paths_of(task.registrations.values())
-    clocks = load_clocks(task.clocks)
+    clocks = load_clocks(task.clocks.path)
     capture = load_capture(task.capture, task.keyframes, clocks=clocks, threads=threads)
     found = RegisteredCameras.load(paths, scene.maps, clocks)
-    merge = None if task.merge is None else read_dataclass(MergeResult, task.merge.path, "merge")
+    merge = None if task.merge is None else load_motion(task.merge)
     registrations = [load_registration(artefact) for artefact in paths]
     transforms = _transforms_of(scene.maps, merge)
     points = [transforms[item.gauge].apply(item.points) for item in scene.maps if item.gauge in transforms]
@@ -89,10 +88,6 @@ def _transforms_of(maps: Sequence[Map], merge: MergeResult | None) -> dict[str, 
     With a motion, these are the transforms of all maps that merging placed in the world. Without a motion,
     only the largest map is shown, untransformed.
     """
-    import numpy as np
-
-    from bodycap_batch.model.geometry import Similarity
-
     if merge is not None:
         return dict(merge.world_from_map)
     return {maps[0].gauge: Similarity(1.0, np.eye(3), np.zeros(3))}
@@ -103,26 +98,8 @@ def _trunk_first(capture: Capture, merge: MergeResult | None) -> Capture:
 
     The preview shows the cameras on the trunk largest.
     """
-    from dataclasses import replace
-
-    from bodycap_batch.model.skeleton_presets import split_side
-
     if merge is None:
         return capture
     limb = {mount.camera: split_side(mount.role)[0] != "" for mount in merge.mounts}
     order = sorted(capture.cameras, key=lambda camera: (camera.name not in limb, limb.get(camera.name)))
     return replace(capture, cameras=tuple(order))
-
-
-PREVIEW = Stage(
-    name="preview",
-    task=PreviewTask,
-    function=run_preview,
-    libraries=(*VISION_LIBRARIES, "scipy", "pycolmap"),
-    modules=(
-        *VISION_MODULES,
-        "bodycap_batch.preview",
-        "pycolmap",
-        "scipy.spatial.transform",
-    ),
-)

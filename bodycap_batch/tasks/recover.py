@@ -11,11 +11,6 @@ from bodycap_batch.core.context import StageContext
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.registration import NOT_ROUNDS, save_registration
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
-
-_MEMORY_MB = 900
-"""Memory to reserve (MB) for a recovery task. Recovery holds a limited number of keyframes and frames in
-memory, about half a megabyte for each image."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +42,6 @@ def run_recover(task: RecoverTask, context: StageContext, files: Path) -> None:
         with_rotation,
     )
 
-    context.check_cancelled()
     capture = load_capture(task.capture, task.keyframes, threads=context.threads)
     paths = paths_of(task.registrations.values())
     scene = load_map(task.map.path)
@@ -65,13 +59,3 @@ def run_recover(task: RecoverTask, context: StageContext, files: Path) -> None:
     )
     registration = recover_lost_frames(load_registration(paths[0]), inputs, task.options, context)
     save_registration(registration, capture.cameras[0], files)
-
-
-RECOVER = Stage(
-    name="recover",
-    task=RecoverTask,
-    function=run_recover,
-    libraries=(*VISION_LIBRARIES, "pycolmap"),
-    modules=(*VISION_MODULES, "pycolmap"),
-    memory_mb=_MEMORY_MB,
-)

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from bodycap_batch.core.arrays import FloatArray
+from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.camera_clock import CameraClock, CaptureClocks, FrameTiming
+from bodycap_batch.model.inertial_camera import InertialCamera
+from bodycap_batch.model.relative_pose import RelativePose, estimate_relative_pose
+from bodycap_batch.model.rolling_shutter import mean_row_fraction
+from bodycap_batch.model.scene import FrameStatus, Map, OtherPaths, Registration, Trajectory
 from bodycap_batch.tasks.loading import load_registration
 from bodycap_batch.tasks.stage import write_summary
-
-if TYPE_CHECKING:
-    from bodycap_batch.core.arrays import FloatArray
-    from bodycap_batch.model.camera_clock import CameraClock, CaptureClocks
-    from bodycap_batch.model.inertial_camera import InertialCamera
-    from bodycap_batch.model.relative_pose import RelativePose
-    from bodycap_batch.model.scene import Map, Registration, Trajectory
 
 INERTIAL_CAMERA = "inertial"
 """Name of the file, without suffix, that holds what the inertial sensor of a camera gives."""
@@ -33,23 +35,15 @@ def replace_registration(found: Registration, before: Path, files: Path, **summa
         files: Folder of the artefact.
         summary: Further values of the summary.
     """
-    from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
-    from bodycap_batch.model.camera import Camera
-    from bodycap_batch.model.camera_clock import FrameTiming
-    from bodycap_batch.model.inertial_camera import InertialCamera
-
     write_dataclass(found, files, "registration")
-    kinds = {"timing": FrameTiming, "camera": Camera, INERTIAL_CAMERA: InertialCamera}
-    for name, kind in kinds.items():
-        if (before / f"{name}.json").exists():
-            write_dataclass(read_dataclass(kind, before, name), files, name)
+    for name in ("timing", "camera", INERTIAL_CAMERA):
+        for file in before.glob(f"{name}.*"):
+            shutil.copyfile(file, files / file.name)
     write_summary(files, **registration_summary(found), **summary)
 
 
 def registration_summary(found: Registration) -> dict[str, Any]:
     """Return the numbers of frames by their outcome, and the frames that should become keyframes."""
-    from bodycap_batch.model.scene import FrameStatus
-
     path = found.trajectory
     return {
         "frames": len(path.status),
@@ -90,13 +84,6 @@ class RegisteredCameras:
             maps: The maps. They name the cameras whose rolling shutter was corrected.
             clocks: The clocks of all cameras.
         """
-        from bodycap_batch.formats.dataclass_files import read_dataclass
-        from bodycap_batch.model.camera import Camera
-        from bodycap_batch.model.camera_clock import FrameTiming
-        from bodycap_batch.model.inertial_camera import InertialCamera
-        from bodycap_batch.model.rolling_shutter import mean_row_fraction
-        from bodycap_batch.model.scene import OtherPaths
-
         corrected = {name for each in maps for name in each.readout_s}
         trajectories: list[Trajectory] = []
         timings: dict[str, FrameTiming] = {}
@@ -132,8 +119,6 @@ class RegisteredCameras:
         Returns:
             The relative poses. A pair with an unknown clock has none.
         """
-        from bodycap_batch.model.relative_pose import estimate_relative_pose
-
         trajectory_of = {path.camera: self._camera_path(path) for path in self.trajectories}
         out = []
         for pair in (pair for names in segments for pair in combinations(sorted(names), 2)):

@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from bodycap_batch.capture import CaptureCamera
 from bodycap_batch.config.options import RegistrationOptions
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.formats.dataclass_files import write_dataclass
+from bodycap_batch.model.camera_clock import FrameTiming
+from bodycap_batch.model.scene import Registration
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.registered_cameras import registration_summary
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
+from bodycap_batch.tasks.stage import write_summary
 from bodycap_batch.tasks.typed_json import omitted_from_key
-
-if TYPE_CHECKING:
-    from bodycap_batch.capture import CaptureCamera
-    from bodycap_batch.model.scene import Registration
 
 NOT_ROUNDS = omitted_from_key("rounds")
 """Metadata of a dataclass field; it omits the option `rounds` from the artefact's key. It sets which rounds
@@ -73,20 +72,8 @@ def save_registration(
         files: Folder of the artefact.
         notes: Notes for the user.
     """
-    from bodycap_batch.formats.dataclass_files import write_dataclass
-    from bodycap_batch.model.camera_clock import FrameTiming
-
     write_dataclass(found, files, "registration")
     timing = FrameTiming(nominal_fps=camera.nominal_fps, rolling_shutter_s=camera.rolling_shutter_s)
     write_dataclass(timing, files, "timing")
     write_dataclass(camera.camera, files, "camera")
     write_summary(files, **registration_summary(found), notes=list(notes))
-
-
-REGISTRATION = Stage(
-    name="registration",
-    task=RegistrationTask,
-    function=run_registration,
-    libraries=(*VISION_LIBRARIES, "pycolmap"),
-    modules=(*VISION_MODULES, "pycolmap", "bodycap_batch.registration"),
-)

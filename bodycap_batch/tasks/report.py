@@ -8,16 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bodycap_batch.capture import Capture
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.errors import CaptureError
+from bodycap_batch.formats.dataclass_files import read_dataclass
+from bodycap_batch.model.camera_clock import CaptureClocks, FrameTiming
 from bodycap_batch.tasks.body import load_body
 from bodycap_batch.tasks.inputs import ArtefactRef, BodyInput, CaptureRef, paths_of
 from bodycap_batch.tasks.loading import load_capture, load_clocks, load_keyframes, load_map, load_registration
-from bodycap_batch.tasks.stage import RESULTS_FOLDER, VISION_LIBRARIES, VISION_MODULES, Stage
+from bodycap_batch.tasks.motion import load_motion
+from bodycap_batch.tasks.stage import RESULTS_FOLDER
 
 if TYPE_CHECKING:
-    from bodycap_batch.capture import Capture
-    from bodycap_batch.model.camera_clock import CaptureClocks
-    from bodycap_batch.model.merge_data import MergeResult
     from bodycap_batch.report import ReportInputs
 
 
@@ -72,8 +74,6 @@ def load_inputs(task: ReportTask, threads: int = 0) -> ReportInputs:
         task: The report's task, which names the stored results.
         threads: Number of threads of each video decoder; 0 lets the decoder choose.
     """
-    from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.model.camera_clock import CaptureClocks, FrameTiming
     from bodycap_batch.report import ReportInputs
 
     paths = paths_of(task.registrations.values())
@@ -82,7 +82,7 @@ def load_inputs(task: ReportTask, threads: int = 0) -> ReportInputs:
         found.trajectory.camera: read_dataclass(FrameTiming, path, "timing")
         for path, found in zip(paths, registrations, strict=True)
     }
-    clocks = CaptureClocks(reference="") if task.clocks is None else load_clocks(task.clocks)
+    clocks = CaptureClocks(reference="") if task.clocks is None else load_clocks(task.clocks.path)
     maps = () if task.map is None else load_map(task.map.path).maps
     return ReportInputs(
         name=task.name,
@@ -92,7 +92,7 @@ def load_inputs(task: ReportTask, threads: int = 0) -> ReportInputs:
         clocks=clocks.with_timing(timings),
         reference_camera=clocks.reference,
         selections=tuple(load_keyframes(artefact.path) for artefact in task.keyframes.values()),
-        merge=_load_merge(task.merge),
+        merge=None if task.merge is None else load_motion(task.merge),
         mounts=() if task.body is None else load_body(task.body)[1],
         metrics=None
         if task.export is None
@@ -111,13 +111,6 @@ def _result_files(export: ArtefactRef) -> tuple[str, ...]:
     return tuple(sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()))
 
 
-def _load_merge(merge: ArtefactRef | None) -> MergeResult | None:
-    from bodycap_batch.formats.dataclass_files import read_dataclass
-    from bodycap_batch.model.merge_data import MergeResult
-
-    return None if merge is None else read_dataclass(MergeResult, merge.path, "merge")
-
-
 def _open_capture(task: ReportTask, clocks: CaptureClocks, threads: int) -> Capture | None:
     """Open the videos of a job.
 
@@ -128,20 +121,9 @@ def _open_capture(task: ReportTask, clocks: CaptureClocks, threads: int) -> Capt
     Raises:
         CaptureError: The videos cannot be read, but the job has not failed.
     """
-    from bodycap_batch.core.errors import CaptureError
-
     try:
         return load_capture(task.capture, task.keyframes, clocks=clocks, threads=threads)
     except CaptureError:
         if task.failure is None:
             raise
         return None
-
-
-REPORT = Stage(
-    name="report",
-    task=ReportTask,
-    function=run_report,
-    libraries=(*VISION_LIBRARIES, "jinja2", "k3d", "pycolmap", "scipy"),
-    modules=(*VISION_MODULES, "bodycap_batch.report", "jinja2", "pycolmap", "scipy.spatial.transform"),
-)

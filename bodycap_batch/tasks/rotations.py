@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bodycap_batch.config.path_bounds import MAX_CONTRADICTED, MAX_UNCERTAINTY
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.core.mechanisms import Mechanism, record_act
+from bodycap_batch.model.camera import Camera
+from bodycap_batch.model.scene import KeyframeSelection, Map, Trajectory
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_keyframes, load_map, load_registration
 from bodycap_batch.tasks.registered_cameras import replace_registration
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage
-
-if TYPE_CHECKING:
-    from bodycap_batch.model.camera import Camera
-    from bodycap_batch.model.scene import KeyframeSelection, Map, Trajectory
 
 _PROGRESS_FRAMES = 10
 """Number of frames between two reports of progress."""
@@ -80,9 +78,6 @@ def without_positions(links: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 def run_rotations(task: RotationsTask, context: StageContext, files: Path) -> None:
     """Store the camera's registration with its rotations alone; as it was if the camera moves."""
-    from dataclasses import replace
-
-    from bodycap_batch.core.mechanisms import Mechanism, record_act
     from bodycap_batch.tracks import measure_pure_rotation, rotations_alone, track_video
 
     camera = load_capture(task.capture, task.keyframes, threads=context.threads).cameras[0]
@@ -121,12 +116,3 @@ def lens_for_rotations(start: Camera, selection: KeyframeSelection) -> tuple[Cam
     return (
         (start, _START_SIGMA) if selection.lens is None else (selection.lens.lens, selection.lens.focal_sigma)
     )
-
-
-ROTATIONS = Stage(
-    name="rotations",
-    task=RotationsTask,
-    function=run_rotations,
-    libraries=(*VISION_LIBRARIES, "pycolmap", "scipy"),
-    modules=(*VISION_MODULES, "pycolmap"),
-)

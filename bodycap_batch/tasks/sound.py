@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 from bodycap_batch.config.models import CaptureConfig
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.formats.dataclass_files import read_dataclass, write_dataclass
 from bodycap_batch.tasks.inputs import CaptureRef
-from bodycap_batch.tasks.stage import VISION_LIBRARIES, VISION_MODULES, Stage, write_summary
+from bodycap_batch.tasks.stage import write_summary
 
 if TYPE_CHECKING:
     from bodycap_batch.clocks import SoundEvidence
@@ -32,9 +33,7 @@ class SoundTask:
 def run_sound(task: SoundTask, context: StageContext, files: Path) -> None:
     """Compare the sound of all pairs of cameras, and store what it says about the clocks."""
     from bodycap_batch.clocks import measure_sound
-    from bodycap_batch.formats.dataclass_files import write_dataclass
 
-    context.check_cancelled()
     found = measure_sound(task.capture.config, context.threads)
     write_dataclass(found, files, SOUND_NAME)
     write_summary(files)
@@ -47,7 +46,6 @@ def load_sound(artefact: Path | None) -> SoundEvidence:
         artefact: Folder of the artefact of the stage `sound`; None if there is only one camera.
     """
     from bodycap_batch.clocks import SoundEvidence
-    from bodycap_batch.formats.dataclass_files import read_dataclass
 
     return SoundEvidence() if artefact is None else read_dataclass(SoundEvidence, artefact, SOUND_NAME)
 
@@ -63,8 +61,3 @@ def known_from_sound(capture: CaptureConfig, artefact: Path | None) -> CaptureCo
 
     clocks = decide_clocks(capture, combine_evidence(capture, load_sound(artefact)))
     return with_known_offsets(capture, clocks)
-
-
-SOUND = Stage(
-    name="sound", task=SoundTask, function=run_sound, libraries=VISION_LIBRARIES, modules=VISION_MODULES
-)

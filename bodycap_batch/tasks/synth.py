@@ -8,7 +8,7 @@ from pathlib import Path
 from bodycap_batch.core.context import StageContext
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.tasks.inputs import FileRef
-from bodycap_batch.tasks.stage import CAPTURE_FOLDER, Stage
+from bodycap_batch.tasks.stage import CAPTURE_FOLDER
 from bodycap_batch.tasks.typed_json import omitted_from_key
 
 
@@ -32,11 +32,3 @@ def run_synth(task: SynthTask, context: StageContext, files: Path) -> None:
     from bodycap_batch.synthetic import synthesise
 
     synthesise(task.options, files / CAPTURE_FOLDER, context)
-
-
-SYNTH = Stage(
-    name="synth",
-    task=SynthTask,
-    function=run_synth,
-    libraries=("numpy", "av", "open3d-cpu|open3d"),
-)

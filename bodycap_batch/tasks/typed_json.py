@@ -9,22 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from functools import cache
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import (
-    Any,
-    Protocol,
-    TypeVar,
-    Union,
-    cast,
-    get_args,
-    get_origin,
-    get_type_hints,
-    runtime_checkable,
-)
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
-from pydantic import BaseModel
+from pydantic import BaseModel, TypeAdapter
 
 _Loaded = TypeVar("_Loaded")
 _OPTIONS = "options"
@@ -58,7 +46,7 @@ def to_json(value: Any) -> Any:
 
 def from_json(kind: type[_Loaded], data: Any) -> _Loaded:
     """Rebuild a task from the JSON values that `to_json` returned."""
-    return cast(_Loaded, _typed(kind, data))
+    return TypeAdapter(kind).validate_python(data)
 
 
 def key_inputs(task: Any) -> dict[str, Any]:
@@ -108,40 +96,3 @@ def _plain(value: Any, describe: Callable[[Any], Any]) -> Any:
 
 def _fields(value: Any, plain: Callable[[Any], Any]) -> dict[str, Any]:
     return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-
-
-def _typed(kind: Any, data: Any) -> Any:
-    """Rebuild a value from JSON values, given the annotated type of the value."""
-    if (origin := get_origin(kind)) is not None:
-        return _generic(origin, get_args(kind), data)
-    if kind is Path:
-        return Path(data)
-    if not isinstance(kind, type):
-        return data
-    if issubclass(kind, BaseModel):
-        return kind.model_validate(data)
-    if dataclasses.is_dataclass(kind):
-        hints = _hints(kind)
-        values = {
-            field.name: _typed(hints[field.name], data[field.name]) for field in dataclasses.fields(kind)
-        }
-        return cast(Any, kind)(**values)
-    return data
-
-
-def _generic(origin: Any, arguments: tuple[Any, ...], data: Any) -> Any:
-    """Rebuild a value of a type with parameters: ``X | None``, a tuple or a mapping."""
-    if origin in (Union, UnionType):
-        (kind,) = (argument for argument in arguments if argument is not NoneType)
-        return None if data is None else _typed(kind, data)
-    if origin is tuple:
-        kinds = [arguments[0]] * len(data) if arguments[-1] is Ellipsis else arguments
-        return tuple(_typed(kind, part) for kind, part in zip(kinds, data, strict=True))
-    if origin is Mapping or (isinstance(origin, type) and issubclass(origin, Mapping)):
-        return {name: _typed(arguments[1], part) for name, part in data.items()}
-    return data
-
-
-@cache
-def _hints(kind: Any) -> dict[str, Any]:
-    return get_type_hints(kind)

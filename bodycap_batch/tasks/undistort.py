@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
+
 from bodycap_batch.core.context import StageContext
+from bodycap_batch.model.camera import with_two_focal_lengths
+from bodycap_batch.model.pinhole import pinhole_of
 from bodycap_batch.tasks.inputs import ArtefactRef, CaptureRef
 from bodycap_batch.tasks.loading import load_capture, load_map
-from bodycap_batch.tasks.stage import RESULTS_FOLDER, VISION_LIBRARIES, VISION_MODULES, Stage
+from bodycap_batch.tasks.stage import RESULTS_FOLDER
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,14 +37,7 @@ class UndistortTask:
 
 def run_undistort(task: UndistortTask, context: StageContext, files: Path) -> None:
     """Write the clip of the camera."""
-    from dataclasses import replace
-    from fractions import Fraction
-
-    import numpy as np
-
     from bodycap_batch.export.camera_files import CAMERA_FACTS_FILE
-    from bodycap_batch.model.camera import with_two_focal_lengths
-    from bodycap_batch.model.pinhole import pinhole_of
     from bodycap_batch.preview import UndistortedClip, write_undistorted_clip
 
     text = (task.export.path / RESULTS_FOLDER / CAMERA_FACTS_FILE).read_text(encoding="utf-8")
@@ -61,12 +59,3 @@ def run_undistort(task: UndistortTask, context: StageContext, files: Path) -> No
         timecode=facts.get("start_timecode", ""),
     )
     write_undistorted_clip(clip, context)
-
-
-UNDISTORT = Stage(
-    name="undistort",
-    task=UndistortTask,
-    function=run_undistort,
-    libraries=(*VISION_LIBRARIES, "pycolmap"),
-    modules=(*VISION_MODULES, "bodycap_batch.preview", "pycolmap"),
-)

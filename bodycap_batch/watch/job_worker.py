@@ -23,7 +23,6 @@ from bodycap_batch.core.errors import (
 )
 from bodycap_batch.pipeline import Settings, run_job
 from bodycap_batch.runner import CHILD_COMMAND
-from bodycap_batch.runner.turns import Turns
 from bodycap_batch.store.artefacts import Store, disk_error, store_error
 from bodycap_batch.store.references import StoreBusy, moving
 from bodycap_batch.watch.dropped_job import JobPermissions, make_result_paths_relative, read_job
@@ -101,7 +100,6 @@ class JobWorker:
         self._options = options
         self._stop = stop
         self._disk_failures: Counter[str] = Counter()
-        self._stage_turns = Turns()
         self._store = Store(options.store or spool.root / ".store")
 
     def process(self, job_dir: JobDir) -> JobOutcome:
@@ -155,7 +153,6 @@ class JobWorker:
             cancelled=lambda: self._is_cancelled(job_dir),
             command=self._options.command,
             limits=self._options.permissions.limits,
-            turns=self._stage_turns,
         )
         try:
             summary = run_job(job, out_dir=job_dir.result, settings=settings)

@@ -24,7 +24,7 @@ from bodycap_batch.cli import main
 from bodycap_batch.cli.application import COMMAND_GROUPS, app
 from bodycap_batch.formats.frame_table import COLUMNS
 from bodycap_batch.runner import Children
-from bodycap_batch.tasks.check import CHECK
+from bodycap_batch.tasks.stages import STAGES
 from tests.pipeline.fake_bodycap import run_here
 from tests.pipeline.fake_stages import ORDERS, give_orders
 from tests.processes import gone
@@ -109,7 +109,7 @@ def test_the_second_run_has_nothing_to_do(bench: Bench) -> None:
 def test_a_child_starts_ahead_if_there_are_no_results(bench: Bench) -> None:
     with mock.patch.object(Children, "start_ahead", autospec=True) as start_ahead:
         assert bench.run("run", "my walk")[0] == 0
-        assert [call.args[1] for call in start_ahead.call_args_list] == [CHECK.modules]
+        assert [call.args[1] for call in start_ahead.call_args_list] == [STAGES["check"].modules]
         assert bench.run("run", "my walk")[0] == 0
         assert start_ahead.call_count == 1, "all stages may be stored"
 

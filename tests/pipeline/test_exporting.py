@@ -117,8 +117,7 @@ def test_the_results_of_a_job_whose_places_were_found_are_stored_for_both_jobs(b
     for asked in (job, with_places):
         assert found_again(bench, asked)["fill"] == last["fill"]
     results, _ = find_stored(job, bench.out, bench.settings(), last="fill")
-    assert results.job is not None
-    assert {camera.name: camera.mount for camera in results.job.capture.cameras} == FOUND
+    assert {camera.name: camera.mount for camera in results.facts.job.capture.cameras} == FOUND
 
 
 def test_the_videos_are_in_the_record_of_the_run(bench: Bench) -> None:

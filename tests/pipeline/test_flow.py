@@ -15,7 +15,8 @@ import yaml
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.pipeline import Settings, run_job
-from bodycap_batch.pipeline.flow import Flow, _read_ahead
+from bodycap_batch.pipeline.flow import _read_ahead
+from bodycap_batch.pipeline.stage_runner import StageRunner
 from bodycap_batch.runner import Children, Task, TaskEnvironment
 from bodycap_batch.runner.child_pool import do_nothing
 from bodycap_batch.store.artefacts import Store
@@ -46,8 +47,8 @@ def test_the_last_cameras_share_all_threads(
     settings = Settings(
         store=Store(tmp_path), threads=threads, listener=lambda _: None, cancelled=lambda: False
     )
-    flow = Flow(job, settings, logs=tmp_path / "out" / "logs")
-    assert flow.runner.threads_per_camera() == expected
+    runner = StageRunner.of(job, settings, tmp_path / "out")
+    assert runner.threads_per_camera() == expected
 
 
 class Watched(Children):
@@ -96,7 +97,7 @@ def test_modules_of_later_stages_load_while_a_core_is_idle(bench: Bench, threads
 def test_the_code_of_later_stages_is_read_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[str] = []
     monkeypatch.setattr(Program, "versions", lambda program: read.append(program.module))
-    _read_ahead([STAGES["merge"], STAGES["export"]])
+    _read_ahead(["merge", "export"])
     assert read == ["tasks.merge", "tasks.export"]
     assert "scipy.special" in sys.modules
 

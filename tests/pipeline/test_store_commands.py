@@ -23,7 +23,8 @@ from bodycap_batch.store.artefacts import ArtefactKey, Store
 from bodycap_batch.store.digests import _entry_text
 from bodycap_batch.store.garbage_collection import collect_garbage
 from bodycap_batch.store.references import References, in_use, moving
-from bodycap_batch.tasks.order import StageName, stages_from
+from bodycap_batch.tasks.order import StageName
+from bodycap_batch.tasks.stages import stages_from
 from tests.pipeline.test_run import ALL, CHILD, CLOCKED, PER_CAMERA, REGISTERED, Bench, bench, done, done_once
 
 __all__ = ["bench", "done", "done_once"]

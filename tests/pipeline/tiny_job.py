@@ -44,7 +44,9 @@ class Place:
         (folder / "tiny.yaml").write_text(JOB)
         (folder / "done.txt").touch()
         (folder / "pids").mkdir(exist_ok=True)
-        versions = {stage.module: algorithm_version(stage.module) for stage in ALL_STAGES.values()}
+        versions = {
+            stage.program.module: algorithm_version(stage.program.module) for stage in ALL_STAGES.values()
+        }
         (folder / "versions.json").write_text(json.dumps(versions))
         if capture is not None:
             shutil.copytree(capture, folder / "capture", copy_function=os.link)

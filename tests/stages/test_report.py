@@ -16,12 +16,14 @@ import pytest
 
 from bodycap_batch.capture import Capture, CaptureCamera, open_capture
 from bodycap_batch.config.models import CaptureConfig, Job
+from bodycap_batch.core.errors import CaptureError
 from bodycap_batch.model.camera_clock import ClockRelation
 from bodycap_batch.model.geometry import interpolate_pose
 from bodycap_batch.model.merge_report import MergeReport
 from bodycap_batch.model.optical_flow import BLUR_SHARPNESS_RATIO
 from bodycap_batch.model.scene import FrameStatus, KeyframeSelection, Trajectory
 from bodycap_batch.model.skeleton import MountSlip
+from bodycap_batch.pipeline.job_facts import JobFacts
 from bodycap_batch.pipeline.stage_results import StageResults, report_task
 from bodycap_batch.report import ReportInputs
 from bodycap_batch.report.advice import count_shared_points, recommend_changes
@@ -608,8 +610,8 @@ def test_a_gap_is_bridged_up_to_the_limit_of_the_job(
 def test_the_report_gets_the_limit_of_the_job(tmp_path: Path) -> None:
     camera = {"name": "torso", "video": ["torso.mp4"]}
     job = Job.model_validate({"capture": {"cameras": [camera]}, "merge": {"max_gap_s": 0.4}})
-    failure = {"stage": "check", "message": "no video"}
-    task = report_task(job, StageResults(), {}, FileDigests(tmp_path), failure)
+    results = StageResults(facts=JobFacts.of(job))
+    task = report_task(results, FileDigests(tmp_path), CaptureError("no video"))
     assert load_inputs(task).max_gap_s == 0.4
 
 

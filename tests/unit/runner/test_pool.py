@@ -13,7 +13,7 @@ from bodycap_batch.core.errors import Cancelled
 from bodycap_batch.runner import Task, TaskEnvironment
 from bodycap_batch.runner.memory_limit import machine_memory_mb
 from bodycap_batch.runner.pool import Slots
-from bodycap_batch.runner.turns import Turns, TurnTakingExecutor
+from bodycap_batch.runner.turns import turn
 from bodycap_batch.store.artefacts import ArtefactKey, Store
 
 
@@ -123,11 +123,11 @@ def environment_in(store: Store, cancelled: threading.Event | None = None) -> Ta
 def test_a_task_of_two_jobs_is_computed_once_unless_it_replaces_its_artefact(
     tmp_path: Path, again: bool
 ) -> None:
-    turns, store, task = Turns(), Store(tmp_path), replace(a_task(), replaces=again)
+    store, task = Store(tmp_path), replace(a_task(), replaces=again)
     made: list[int] = []
 
     def work(number: int) -> None:
-        with turns.taken(task, environment_in(store)) as there:
+        with turn(task, environment_in(store)) as there:
             if there:
                 return
             made.append(number)
@@ -145,52 +145,19 @@ def test_a_task_of_two_jobs_is_computed_once_unless_it_replaces_its_artefact(
     assert (store.find(task.key) or pytest.fail("lost")).path.joinpath("made_by").read_text() == str(made[-1])
 
 
-class Counting:
-    """Makes an artefact slowly and counts how often."""
-
-    def __init__(self) -> None:
-        self.made = self.closed = 0
-
-    def execute(self, task: Task, environment: TaskEnvironment) -> None:
-        self.made += 1
-        time.sleep(0.05)
-        with environment.store.draft(task.key) as draft:
-            (draft.files / "made_by").write_text("somebody")
-            environment.store.commit(draft, task.key, {})
-
-    def close(self, logs: Path) -> None:
-        self.closed += 1
-
-
-def test_jobs_wait_for_tasks_that_other_jobs_compute(tmp_path: Path) -> None:
-    store, turns, executors = Store(tmp_path), Turns(), [Counting() for _ in range(3)]
-    jobs = [TurnTakingExecutor(own, turns) for own in executors]
-    threads = [threading.Thread(target=job.execute, args=[a_task(), environment_in(store)]) for job in jobs]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(10)
-    for job in jobs:
-        job.close(tmp_path)
-    assert sum(own.made for own in executors) == 1
-    assert [own.closed for own in executors] == [1, 1, 1]
-
-
 def test_a_waiting_job_can_be_stopped_and_takes_over_if_the_other_failed(tmp_path: Path) -> None:
-    turns, store, stop = Turns(), Store(tmp_path), threading.Event()
+    store, stop = Store(tmp_path), threading.Event()
     stop.set()
 
     def fail_while_another_is_stopped() -> None:
-        with turns.taken(a_task(), environment_in(store)) as there:
+        with turn(a_task(), environment_in(store)) as there:
             assert not there
-            with pytest.raises(Cancelled), turns.taken(a_task(), environment_in(store, stop)):
+            with pytest.raises(Cancelled), turn(a_task(), environment_in(store, stop)):
                 pytest.fail("two at once")
-            with turns.taken(
-                replace(a_task(), key=replace(a_task().key, stage="merge")), environment_in(store)
-            ):
+            with turn(replace(a_task(), key=replace(a_task().key, stage="merge")), environment_in(store)):
                 raise RuntimeError("no map")
 
     with pytest.raises(RuntimeError, match="no map"):
         fail_while_another_is_stopped()
-    with turns.taken(a_task(), environment_in(store)) as there:
+    with turn(a_task(), environment_in(store)) as there:
         assert not there

@@ -27,7 +27,7 @@ from bodycap_batch.core.errors import (
     StoreError,
 )
 from bodycap_batch.core.progress import Event
-from bodycap_batch.runner import Children, NotStored, Rules, Runner, Task
+from bodycap_batch.runner import Children, NotStored, Rules, Runner, Task, TaskEnvironment
 from bodycap_batch.runner.child_main import DiskFailures
 from bodycap_batch.runner.child_pool import CHILDREN_LOG, Preload
 from bodycap_batch.store.artefacts import ArtefactKey, Store
@@ -438,3 +438,30 @@ def test_only_plain_files_are_read_to_find_the_cause(tmp_path: Path) -> None:
     for path in (pipe, tmp_path, tmp_path / "none"):
         with pytest.raises(CaptureError, match="no such video"), DiskFailures(Store(tmp_path / "store")):
             raise CaptureError("no such video", path=path)
+
+
+class Counting:
+    """Makes an artefact slowly and counts how often."""
+
+    def __init__(self) -> None:
+        self.made = 0
+
+    def execute(self, task: Task, environment: TaskEnvironment) -> None:
+        self.made += 1
+        time.sleep(0.05)
+        with environment.store.draft(task.key) as draft:
+            (draft.files / "made_by").write_text("somebody")
+            environment.store.commit(draft, task.key, {"seconds": 0.1})
+
+    def close(self, logs: Path) -> None:
+        pass
+
+
+def test_jobs_wait_for_tasks_that_other_jobs_compute(tmp_path: Path) -> None:
+    store, executors = Store(tmp_path / "store"), [Counting() for _ in range(3)]
+    rules = Rules(cancelled=lambda: False)
+    runners = [Runner(store, own, logs=tmp_path, listener=lambda _: None, rules=rules) for own in executors]
+    with ThreadPoolExecutor() as pool:
+        results = list(pool.map(lambda runner: runner.run(a_task("work")), runners))
+    assert sum(own.made for own in executors) == 1
+    assert len({artefact.path for artefact, _ in results}) == 1

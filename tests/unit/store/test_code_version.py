@@ -34,7 +34,7 @@ def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def versions() -> dict[str, str]:
     forget()
-    return {name: code_version.algorithm_version(stage.module) for name, stage in STAGES.items()}
+    return {name: code_version.algorithm_version(stage.program.module) for name, stage in STAGES.items()}
 
 
 def changed_by(path: Path, text: str = "\nANOTHER = 1\n") -> set[str]:
@@ -58,17 +58,17 @@ def imported_modules(path: Path) -> Iterator[str]:
 
 def test_the_same_sources_have_the_same_version(copied: Path) -> None:
     assert versions() == versions()
-    assert len(set(versions().values())) == len({stage.module for stage in STAGES.values()})
+    assert len(set(versions().values())) == len({stage.program.module for stage in STAGES.values()})
 
 
 READ_BY_ALL = {"config", "core", "formats", "model", "tasks"}
 CAMERAS = READ_BY_ALL | {"capture", "presets"}
 BODY = CAMERAS
 HASHED = {
-    "synth": BODY | {"synthetic"},
+    "synth": READ_BY_ALL | {"presets", "synthetic"},
     "check": BODY | {"check", "store", "telemetry"},
     "inertial": CAMERAS | {"inertial", "registration", "telemetry"},
-    "sound": CAMERAS | {"clocks", "telemetry"},
+    "sound": READ_BY_ALL | {"capture", "clocks", "telemetry"},
     # The clocks stage compares the distances between the cameras with the reach of the body.
     "clocks": CAMERAS | {"clocks", "mapping", "telemetry"},
     "keyframes": CAMERAS | {"keyframes", "telemetry", "tracks"},
@@ -82,7 +82,7 @@ HASHED = {
     "rotations": CAMERAS | {"tracks"},
     # Merging reads marker boards from the images, and explains a failure by mirrored cameras.
     "merge": BODY | {"merging", "calibration", "mapping"},
-    "fill": BODY | {"fill"},
+    "fill": {"core", "formats", "model", "presets", "tasks", "fill"},
     # The places of unnamed cameras follow from their paths alone.
     "places": CAMERAS | {"camera_places"},
     # The files state the timecode of the videos.
@@ -93,14 +93,13 @@ HASHED = {
 }
 """Packages whose files are part of a stage's version.
 
-They are those of version 0.1.0 at their new places. The preview alone lost one: it no longer projects the
-motion, so it does not depend on the export. Of the presets, opening a camera reads the table of lenses alone.
+Of the presets, opening a camera reads the table of lenses alone.
 """
 
 
 @pytest.mark.parametrize("stage", sorted(STAGES))
 def test_the_code_of_a_stage_is_that_of_these_packages(copied: Path, stage: str) -> None:
-    found = code_version._closure(STAGES[stage].module)
+    found = code_version._closure(STAGES[stage].program.module)
     packages = {path.relative_to(copied).parts[0].removesuffix(".py") for path in found}
     assert packages == HASHED[stage]
 
@@ -117,7 +116,7 @@ def test_every_import_is_found() -> None:
     ("stage", "package"), [("map", "mapping"), ("registration", "registration"), ("merge", "merging")]
 )
 def test_all_files_of_an_estimator_count(copied: Path, stage: str, package: str) -> None:
-    found = code_version._closure(STAGES[stage].module)
+    found = code_version._closure(STAGES[stage].program.module)
     assert set((copied / package).rglob("*.py")) <= found
 
 

@@ -23,7 +23,7 @@ from bodycap_batch.pipeline.inputs import capture_ref
 from bodycap_batch.pipeline.task_keys import artefact_key, make_task
 from bodycap_batch.synthetic.options import SynthOptions
 from bodycap_batch.tasks.check import CheckTask
-from bodycap_batch.tasks.clocks import CameraDistance, ClocksTask
+from bodycap_batch.tasks.clocks import ClocksTask
 from bodycap_batch.tasks.export import ExportTask
 from bodycap_batch.tasks.fill import FillTask
 from bodycap_batch.tasks.further import FurtherMapsTask, FurtherPosesTask
@@ -139,7 +139,7 @@ def tasks(folder: Path) -> dict[str, Any]:
             sound=scene_map,
             map=scene_map,
             registrations=stored,
-            reach=(CameraDistance(first="head", second="torso", least_m=0.1, most_m=0.9),),
+            reach=(("head", "torso", 0.1, 0.9),),
         ),
         "places": PlacesTask(stated={"a": "torso"}, clocks={"": scene_map}, registrations=stored),
         "merge": MergeTask(
@@ -193,7 +193,7 @@ def test_a_child_reads_back_the_task_that_was_written(tmp_path: Path, name: str)
 
 @every_stage
 def test_a_key_depends_on_contents_and_not_on_paths(tmp_path: Path, name: str) -> None:
-    here, there = (artefact_key(STAGES[name], tasks(tmp_path / place)[name]) for place in ("a", "b"))
+    here, there = (artefact_key(tasks(tmp_path / place)[name]) for place in ("a", "b"))
     assert here == there
     assert str(tmp_path) not in json.dumps(here.document())
 
@@ -210,7 +210,7 @@ def test_another_digest_gives_another_key(tmp_path: Path) -> None:
     other = replace(
         task, keyframes={**task.keyframes, "head": ArtefactRef(path=tmp_path / "head", digest="x")}
     )
-    assert artefact_key(STAGES["map"], task).name != artefact_key(STAGES["map"], other).name
+    assert artefact_key(task).name != artefact_key(other).name
 
 
 @pytest.mark.parametrize(("name", "omitted"), [("registration", "rounds"), ("export", "preview")])
@@ -224,6 +224,6 @@ def test_the_store_finds_the_artefacts_that_a_task_reads(tmp_path: Path) -> None
     from bodycap_batch.store.artefacts import Store
 
     store = Store(tmp_path)
-    task = make_task(STAGES["recover"], tasks(tmp_path / "artefacts" / "any")["recover"])
+    task = make_task(tasks(tmp_path / "artefacts" / "any")["recover"])
     found = {path.name for path in store.artefacts_in(task.arguments)}
     assert {"torso", "head", "map"} <= found
