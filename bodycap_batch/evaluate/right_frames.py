@@ -26,8 +26,6 @@ from bodycap_batch.tracks.relative_motion import Motion, RayMatches, measure_rot
 
 GAPS = {1: 1, 5: 1, 15: 3, 45: 3}
 """Distances in frames of the linked frames, and every how many frames a link starts."""
-_MAX_CHAIN_SIGMA_DEG = 5.0
-"""Maximum standard deviation (degrees) of a turn across lost frames that confirms a path."""
 _MAX_READOUT_TURN_DEG = 2.0
 """Maximum turn (degrees) during the readout of a frame whose points are used for positions. Evidence:
 docs/decisions/report.md."""
@@ -284,15 +282,17 @@ def _judge_pair(pictures: Pictures, frames: tuple[int, int], world_from_cam: Flo
 
 
 def _judge_gap(pictures: Pictures, frames: tuple[int, int], world_from_cam: FloatArray) -> Outcome:
-    """Compare the delivered rotation across lost frames with the turn that the tracks show."""
+    """Compare the delivered rotation across lost frames with the turn that the tracks show.
+
+    An inexact turn that agrees is right, as in `judge_rotation`: another one would not agree.
+    """
     chain = pictures.rotation_chain
     found = None if chain is None else chain.compare(*frames, world_from_cam[list(frames), :3, :3])
     if found is None:
         return Outcome.UNMEASURABLE
     if found.is_wrong(np.deg2rad(WRONG_DEG)):
         return Outcome.WRONG
-    is_exact = found.sigma_rad < np.deg2rad(_MAX_CHAIN_SIGMA_DEG)
-    return Outcome.RIGHT if is_exact else Outcome.UNMEASURABLE
+    return Outcome.RIGHT if found.angle_rad <= np.deg2rad(WRONG_DEG) else Outcome.UNMEASURABLE
 
 
 def find_right_frames(
