@@ -20,7 +20,7 @@ from bodycap_batch.evaluate.breaks import contradicted_times, scale_jumps
 from bodycap_batch.evaluate.fresh_features import FrameFeatures, match_features
 from bodycap_batch.evaluate.three_view import CommonRays, Legs, judge_legs, measure_legs
 from bodycap_batch.evaluate.two_view import WRONG_DEG, Outcome, judge_rotation
-from bodycap_batch.model.geometry import so3_exp, so3_log
+from bodycap_batch.model.geometry import rotation_angle_rad, so3_exp, so3_log
 from bodycap_batch.model.rotation_chain import RotationChain
 from bodycap_batch.tracks.relative_motion import Motion, RayMatches, measure_rotation
 
@@ -37,6 +37,9 @@ _FIXED_SHARE = 0.2
 """Maximum displacement of a match that is fixed to the camera, as a share of that of the room. Evidence: the
 hand beside a wrist camera gave wrong legs in 25 of 38 triples of a path whose rotations agree in 365 of 367
 pairs."""
+_STEPS = (5, 3, 2, 1)
+"""Distances in frames of the pairs across lost frames, in the order in which they are tried. Between near
+frames the pictures hardly distinguish a turn from a step to the side, and all errors have the same sign."""
 _MIN_WRONG_LINKS = 2
 """Minimum number of wrong rotations across a break, beyond the right ones. The turn across lost frames counts
 twice: it is made of many pairs, and only one spans some gaps."""
@@ -282,17 +285,31 @@ def _judge_pair(pictures: Pictures, frames: tuple[int, int], world_from_cam: Flo
 
 
 def _judge_gap(pictures: Pictures, frames: tuple[int, int], world_from_cam: FloatArray) -> Outcome:
-    """Compare the delivered rotation across lost frames with the turn that the tracks show.
+    """Compare the delivered rotation across lost frames with the turn that the video shows.
 
-    An inexact turn that agrees is right, as in `judge_rotation`: another one would not agree.
+    A turn that agrees is right even if it is inexact, as in `judge_rotation`: another one would not agree.
+    Only the tracks state how exact their turn is, so the pairs of the lost frames contradict nothing.
     """
+    rotations = world_from_cam[list(frames), :3, :3]
     chain = pictures.rotation_chain
-    found = None if chain is None else chain.compare(*frames, world_from_cam[list(frames), :3, :3])
-    if found is None:
-        return Outcome.UNMEASURABLE
-    if found.is_wrong(np.deg2rad(WRONG_DEG)):
+    found = None if chain is None else chain.compare(*frames, rotations)
+    if found is not None and found.is_wrong(np.deg2rad(WRONG_DEG)):
         return Outcome.WRONG
-    return Outcome.RIGHT if found.angle_rad <= np.deg2rad(WRONG_DEG) else Outcome.UNMEASURABLE
+    angle_rad = _angle_from_pairs(pictures, frames, rotations) if found is None else found.angle_rad
+    return Outcome.RIGHT if angle_rad <= np.deg2rad(WRONG_DEG) else Outcome.UNMEASURABLE
+
+
+def _angle_from_pairs(pictures: Pictures, frames: tuple[int, int], rotations: FloatArray) -> float:
+    """Return the angle between a turn (2,3,3) and that of the pairs between; infinity if they have a gap."""
+    turn, index = np.eye(3), frames[0]
+    while index < frames[1]:
+        steps = (min(index + step, frames[1]) for step in _STEPS)
+        tried = ((end, pictures.pair(index, end).measured) for end in steps)
+        end, measured = next((pair for pair in tried if pair[1] is not None), (index, None))
+        if measured is None:
+            return np.inf
+        turn, index = measured.rotation @ turn, end
+    return float(rotation_angle_rad(rotations[1].T @ rotations[0] @ turn.T))
 
 
 def find_right_frames(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 from bodycap_batch.core.mechanisms import Mechanism, is_on, record_act
@@ -41,9 +41,8 @@ def repair_model(
     """Register misregistered keyframes once more, and remove those that still contradict the model.
 
     The keyframes leave the model before they are registered again. Without them, the points that they bent
-    are right, so most find their true place. At the end, those stay that a second registration, from the
-    points of the other keyframes alone, finds in the same place. The model is not adjusted after the last
-    removal: the stage adjusts it at its end (`finalise_models`). Evidence: docs/decisions/mapping.md.
+    are right, so most find their true place. The model is not adjusted after the last removal: the stage
+    adjusts it at its end (`finalise_models`). Evidence: docs/decisions/mapping.md.
 
     Args:
         model: The largest model; not changed.
@@ -61,7 +60,6 @@ def repair_model(
         model = re_register_images(model, wrong, context, total, structure_less=False)
         record_act(Mechanism.REPAIR)
         pairs, wrong = _find_contradictions(model, context)
-    wrong = _without_confirmed(model, context, pairs, wrong)
     cameras = {
         int(number): ImageRef.parse(model.image(number).name).camera for number in model.reg_image_ids()
     }
@@ -84,7 +82,6 @@ def remove_without_adjustment(
         matches in inconsistent pairs that is left.
     """
     pairs, wrong = _find_contradictions(model, context)
-    wrong = _without_confirmed(model, context, pairs, wrong)
     kept = _without(model, wrong)
     left = registered_ids(kept)
     rest = [pair for pair in pairs if pair.first in left and pair.second in left]
@@ -108,33 +105,22 @@ def _find_contradictions(
     """Return the verified pairs of a model, and the ids of the images that contradict it.
 
     These are the images whose pose or points contradict matches; if no part of the model agrees with itself,
-    only those whose pose does.
+    only those whose pose does. An image whose points alone contradict matches is acquitted if a second
+    registration confirms its pose.
     """
     pairs = evaluate_pairs(context.workspace, model, context.times_ns)
     misregistered = find_misregistered_images(pairs)
     agreement = evaluate_agreement(context.workspace, model, context.times_ns)
     wrong = misregistered | find_misplaced_images(agreement, image_sequences(model))
-    too_few = model.num_reg_images() - len(wrong) < MIN_MODEL_KEYFRAMES
-    return pairs, misregistered if too_few else wrong
-
-
-def _without_confirmed(
-    model: pycolmap.Reconstruction,
-    context: MappingContext,
-    pairs: Sequence[PairConsistency],
-    wrong: Collection[int],
-) -> set[int]:
-    """Return the ids of the images `wrong` without those whose pose a second registration confirms.
-
-    An image whose pose contradicts its matches is never confirmed.
-    """
+    if model.num_reg_images() - len(wrong) < MIN_MODEL_KEYFRAMES:
+        wrong = misregistered
     if not is_on(Mechanism.SECOND_REGISTRATION):
-        return set(wrong)
+        return pairs, wrong
     max_error_px = _CONFIRMED_ERROR_RATIO * context.mapper_options().mapper.filter_max_reproj_error
     confirmed = confirm_images(context.workspace, model, wrong, image_sequences(model), max_error_px)
-    acquitted = confirmed - find_misregistered_images(pairs)
+    acquitted = confirmed - misregistered
     record_act(Mechanism.SECOND_REGISTRATION, len(acquitted))
-    return set(wrong) - acquitted
+    return pairs, wrong - acquitted
 
 
 def _names(model: pycolmap.Reconstruction, image_ids: Collection[int]) -> list[str]:

@@ -154,6 +154,22 @@ def test_a_broken_path_is_found(
     assert (found[BREAK + BORDER_FRAMES :] == "wrong").all()
 
 
+def test_pairs_across_lost_frames_confirm_a_path_and_contradict_none(
+    seen: Pictures, path: FloatArray
+) -> None:
+    posed = np.ones(FRAMES, dtype=bool)
+    posed[25:75] = False
+    # Frames that are 45 apart have no pose across the gap, so only the pairs between can join the two parts.
+    delivered = np.where(posed[:, None, None], path, np.nan)
+    assert find_right_frames(seen, delivered).count(Outcome.RIGHT) == np.count_nonzero(posed)
+    folded = delivered.copy()
+    folded[75:] = fold(path)[75:]
+    found = outcomes(seen, folded)
+    assert (found[:25] == "right").all()
+    assert (found[25:75] == "None").all()
+    assert (found[75:] == "not measurable").all()
+
+
 def test_the_turn_of_the_video_shows_a_fold_across_lost_frames(path: FloatArray) -> None:
     posed = np.ones(FRAMES, dtype=bool)
     posed[40:60] = False
