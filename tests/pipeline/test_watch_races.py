@@ -11,10 +11,9 @@ import pytest
 
 from bodycap_batch.cli import main
 from bodycap_batch.core.errors import JobError
-from bodycap_batch.pipeline import RunSummary, Settings
 from bodycap_batch.store.artefacts import Store
 from bodycap_batch.store.garbage_collection import collect_garbage
-from bodycap_batch.watch import cancel_job, commands, inbox_claim, job_worker, retry_job
+from bodycap_batch.watch import cancel_job, commands, inbox_claim, retry_job
 from bodycap_batch.watch.inbox_entries import InboxEntry, take_snapshot
 from bodycap_batch.watch.spool import RETRY_PREFIX, JobDir
 from tests.pipeline.spools import SpoolFixture, wait_for
@@ -173,18 +172,3 @@ def test_a_job_that_ends_during_the_cancellation_is_done(
     monkeypatch.setattr(Path, "touch", end)
     assert main(["cancel", "walk"]) == 0
     assert "the job ended before it could be cancelled; its state is done" in capfd.readouterr().out
-
-
-def test_parallel_jobs_share_their_stage_turns(bench: SpoolFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    shared: list[object] = []
-
-    def run(job: object, *, out_dir: Path, settings: Settings) -> RunSummary:
-        shared.append(settings.turns)
-        return RunSummary(out_dir=out_dir, files=(), stages=(), versions={})
-
-    monkeypatch.setattr(job_worker, "run_job", run)
-    bench.drop("one")
-    bench.drop("two")
-    assert bench.run_once(jobs=2) == 0
-    assert len(shared) == 2
-    assert shared[0] is shared[1] is not None

@@ -12,6 +12,7 @@ from bodycap_batch.model.nominal_mounts import nominal_mount
 from bodycap_batch.model.skeleton import Motion, forward_kinematics
 from bodycap_batch.model.skeleton_presets import load_skeleton, rest_positions
 from bodycap_batch.synthetic.clip import load_clip
+from bodycap_batch.synthetic.foot_roll import shape_of
 from bodycap_batch.synthetic.gait import Walk, WalkStyle
 from bodycap_batch.synthetic.moving_body import camera_poses_at
 from bodycap_batch.synthetic.person import draw_body, draw_mounts, draw_posture
@@ -78,7 +79,10 @@ def test_the_walker_stands_on_the_floor(walk):
         toe = walk.skeleton.joints.index(f"{side}ToeBase")
         tip = poses[:, toe, :3, :3] @ walk.skeleton.end_offsets_m[toe] + poses[:, toe, :3, 3]
         soles.append(tip[:, 2])
-        soles.append(poses[:, walk.skeleton.joints.index(f"{side}Foot"), 2, 3] - walk._ankle_m)
+        soles.append(
+            poses[:, walk.skeleton.joints.index(f"{side}Foot"), 2, 3]
+            - shape_of(walk.skeleton, "Left").height_m
+        )
     lowest = np.min(soles, axis=0)
     # The soft minimum of four soles is up to 1 cm · ln 4 below them; the heel of a tilted foot adds a little.
     assert lowest.min() > -0.01
