@@ -55,7 +55,7 @@ def decode_frames(
             if frame is None and not frame_decoder.sequential:
                 # Seeking does not work well in some containers (MPEG program streams), and an error in one
                 # frame loses others that several threads decode at the same time. Then all frames are decoded
-                # from the start of the video in one thread.
+                # from the start of the video in one thread, which takes longer.
                 frame_decoder.close()
                 frame_decoder = _ForwardDecoder(video, None, 1)
                 frame = frame_decoder.advance(index)

@@ -69,7 +69,8 @@ def evaluate(
     With --video, features that the job did not use are matched in frames that are 1, 5, 15 and 45 apart, and
     across lost frames. A frame is right if the matches join it to the largest set of frames whose relative
     rotations and positions they confirm. It is wrong if they contradict it by more than 5 degrees, or if the
-    path leaps. Where they say nothing, the frame is not measurable.
+    path leaps; across lost frames, only the turn that points of the video show contradicts it. Where they say
+    nothing, the frame is not measurable.
 
     \b
     Examples:

@@ -135,12 +135,15 @@ def _content_instead(entries: Sequence[Path]) -> str:
     """Return what a folder without videos contains, as the end of a sentence; "" if it is not known."""
     kinds = (("photos", PHOTO_SUFFIXES), ("an archive", ARCHIVE_SUFFIXES))
     found = [name for name, suffixes in kinds if any(path.suffix.lower() in suffixes for path in entries)]
-    inner = {path.name: readable_entries(path) for path in entries if path.is_dir()}
-    deeper = [
-        name
-        for name, paths in inner.items()
-        if any(is_video(video) for path in paths if path.is_dir() for video in readable_entries(path))
-    ]
+    try:
+        inner = {path.name: readable_entries(path) for path in entries if path.is_dir()}
+        deeper = [
+            name
+            for name, paths in inner.items()
+            if any(is_video(video) for path in paths if path.is_dir() for video in readable_entries(path))
+        ]
+    except OSError:
+        deeper = []
     found += [f"the folder {name} with folders of videos" for name in deeper[:1]]
     return f"; it contains {' and '.join(found)}" if found else ""
 
@@ -152,14 +155,12 @@ def _first_step(entries: Sequence[Path]) -> str:
 
 
 def readable_entries(folder: Path) -> list[Path]:
-    """Return the entries of a folder, sorted; none if it cannot be read.
+    """Return the entries of a folder, sorted; none if it may not be read, which is reported where it is used.
 
-    That is reported where the folder is used.
+    Raises:
+        OSError: The disk fails.
     """
-    try:
-        return sorted(folder.iterdir()) if os.access(folder, os.R_OK | os.X_OK) else []
-    except OSError:
-        return []
+    return sorted(folder.iterdir()) if os.access(folder, os.R_OK | os.X_OK) else []
 
 
 def real_path(path: Path) -> Path:

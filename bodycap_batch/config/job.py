@@ -245,7 +245,7 @@ class _StatedJob:
         uses_folder: True if the job uses the videos and the calibration in its folder.
         is_alone: True for a job file that another user submitted without a folder.
         beside: The videos in the folder that the job file does not list.
-        placed: Where the place of a camera comes from if the job states it, by camera name.
+        placed: Where the place of each camera would come from, by camera name.
     """
 
     source: _Source

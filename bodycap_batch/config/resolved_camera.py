@@ -70,7 +70,7 @@ def resolved_camera(
         stated: The capture as the job file states it. It has fewer cameras if videos beside the job file were
             added. If there is no job file, it has no cameras.
         base: Folder to which the paths of the capture are relative.
-        placed: Where the place of a camera comes from if the job states it, by camera name.
+        placed: Where the place of each camera would come from, by camera name.
 
     Raises:
         CaptureError: A calibration cannot be used, a folder holds no video, or the number of timestamp files

@@ -42,7 +42,7 @@ _STEPS = (5, 3, 2, 1)
 frames the pictures hardly distinguish a turn from a step to the side, and all errors have the same sign."""
 _MIN_WRONG_LINKS = 2
 """Minimum number of wrong rotations across a break, beyond the right ones. The turn across lost frames counts
-twice: it is made of many pairs, and only one spans some gaps."""
+twice: it is measured through every frame between, and no other measurement spans some gaps."""
 _MIN_WRONG_LEGS = 3
 """Minimum number of wrong triples across a break, beyond the right ones. Two triples of neighbouring frames
 span each time, so a hand that fills the picture for a moment is no break."""
@@ -287,16 +287,18 @@ def _judge_pair(pictures: Pictures, frames: tuple[int, int], world_from_cam: Flo
 def _judge_gap(pictures: Pictures, frames: tuple[int, int], world_from_cam: FloatArray) -> Outcome:
     """Compare the delivered rotation across lost frames with the turn that the video shows.
 
-    A turn that agrees is right even if it is inexact, as in `judge_rotation`: another one would not agree.
+    A turn that agrees is right even if it is inexact, as in `judge_rotation`: a wrong path would not agree.
     Only the tracks state how exact their turn is, so the pairs of the lost frames contradict nothing.
     """
+    limit_rad = np.deg2rad(WRONG_DEG)
     rotations = world_from_cam[list(frames), :3, :3]
     chain = pictures.rotation_chain
     found = None if chain is None else chain.compare(*frames, rotations)
-    if found is not None and found.is_wrong(np.deg2rad(WRONG_DEG)):
+    if found is not None and found.is_wrong(limit_rad):
         return Outcome.WRONG
-    angle_rad = _angle_from_pairs(pictures, frames, rotations) if found is None else found.angle_rad
-    return Outcome.RIGHT if angle_rad <= np.deg2rad(WRONG_DEG) else Outcome.UNMEASURABLE
+    agrees = found is not None and found.angle_rad <= limit_rad
+    agrees = agrees or _angle_from_pairs(pictures, frames, rotations) <= limit_rad
+    return Outcome.RIGHT if agrees else Outcome.UNMEASURABLE
 
 
 def _angle_from_pairs(pictures: Pictures, frames: tuple[int, int], rotations: FloatArray) -> float:

@@ -206,7 +206,9 @@ def build_map_once(
     write_models(workspace, models)
     calibrated = {number: name for name, number in ids.items() if number in mapping.given_ids}
     misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
-    removed = [name for step in ("repair", "placed") if step in log for name in log[step]["cut"]]
+    # A keyframe that was registered again is in a model, and so is none of the misplaced ones.
+    removed = list(log["repair"]["doubtful"]) if models and "repair" in log else []
+    removed += [name for step in ("repair", "placed") if step in log for name in log[step]["cut"]]
     misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)
     if readouts:
         log["readouts_from_matches"] = {name: asdict(item) for name, item in sorted(readouts.items())}

@@ -1,6 +1,7 @@
-"""The stages of a job as functions: each makes the tasks of a stage, runs them and returns their artefacts.
+"""The stages of a job as functions: each makes the tasks of a stage and runs them.
 
-`run.run_stages` calls them in order.
+They return artefacts, or the results with them; `check` writes the facts into the results. `run.run_stages`
+calls them in order.
 """
 
 from __future__ import annotations
@@ -180,11 +181,11 @@ def register(runner: StageRunner, results: StageResults) -> ByCamera:
     return _run_per_camera(runner, facts, task, map_round=results.map_round)
 
 
-def grow_map(runner: StageRunner, results: StageResults) -> StageResults:
+def extend_map(runner: StageRunner, results: StageResults) -> StageResults:
     """Add keyframes at times of lost frames and register again, until no further frame is localised.
 
     Returns:
-        The results with the grown map and the registrations against this map. A round that fails, or that
+        The results with the extended map and the registrations against this map. A round that fails, or that
         loses frames, is not used. Frames whose pose a round withdraws, because they contradict the map, were
         wrong before and do not count as lost.
     """
@@ -210,14 +211,14 @@ def grow_map(runner: StageRunner, results: StageResults) -> StageResults:
             cause = "the map could not be extended to localise lost frames"
             runner.note(f"{cause}, so the earlier map is kept: {error.message}", "extend")
             break
-        grown = replace(results, map=extended)
-        grown.registrations = register(runner, grown)
-        gained = _posed_frames(grown.registrations) - _posed_frames(results.registrations)
+        larger = replace(results, map=extended)
+        larger.registrations = register(runner, larger)
+        gained = _posed_frames(larger.registrations) - _posed_frames(results.registrations)
         if gained < 0:
             break
         # The new map is used even if no further frame is localised: misregistered keyframes have new poses in
         # the new map.
-        results = grown
+        results = larger
         if gained == 0:
             break
     return results

@@ -170,7 +170,7 @@ def _run_to_paths(runner: StageRunner, results: StageResults) -> Iterator[str]:
     yield "map"
     results.stage = "registration"
     results.registrations = flow.register(runner, results)
-    refined = flow.refine_map(runner, flow.grow_map(runner, results))
+    refined = flow.refine_map(runner, flow.extend_map(runner, results))
     results.map = refined.map
     results.registrations = flow.recover(runner, refined)
     try:

@@ -26,7 +26,7 @@ from bodycap_batch.tasks.report import ReportTask
 class StageResults:
     """The artefacts of a job's stages. `run_stages` sets the field of a stage after the stage has finished.
 
-    This is the only state of a run: the functions of `flow` read it and leave none behind.
+    This is the only state of a run. The functions of `flow` read it; only `check` writes to it, too.
 
     Attributes:
         facts: The job, and what is known about its videos.

@@ -45,7 +45,7 @@ _TURN_WAVES, _STILL_WAVES = (
     ((0.003, 1.3, 1.0), (0.003, 0.9, 1.0), (0.4, 0.7, 1.0)),
 )
 """Motion of a person who rotates on the spot, and of one who stands still, along x, y (m) and about the
-vertical (degrees): amplitude, phase (radians) in a period, and period (s)."""
+vertical (degrees): amplitude, an angle (radians), and the time (s) in which the wave passes this angle."""
 _STILL_NOD_DEG = 22.0
 """Nod (degrees) of a person who looks at a table. Neck and head each turn by 0.6 of it."""
 _STILL_PARTS, _STILL_SHARE, _STILL_ARMS_AHEAD = ("Bend", "Lean", "Turn", "Look", "Nod"), 0.12, 0.7

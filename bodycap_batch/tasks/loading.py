@@ -60,7 +60,6 @@ def load_capture(
 
 
 def _kept_frames(keyframes: ArtefactRef | None) -> KeptFrames | None:
-
     if keyframes is None or not (keyframes.path / f"{KEPT_NAME}.json").exists():
         return None
     return read_dataclass(KeptFrames, keyframes.path, KEPT_NAME)

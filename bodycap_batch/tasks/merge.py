@@ -80,7 +80,6 @@ def run_merge(task: MergeTask, context: StageContext, files: Path) -> None:
 
 
 def _merge_inputs(task: MergeTask) -> MergeInputs:
-
     scene = load_map(task.map.path)
     found = RegisteredCameras.load(
         paths_of(task.registrations.values()), scene.maps, load_clocks(task.clocks.path)

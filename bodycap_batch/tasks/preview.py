@@ -56,7 +56,6 @@ def run_preview(task: PreviewTask, context: StageContext, files: Path) -> None:
 
 
 def _preview_inputs(task: PreviewTask, path: Path, threads: int) -> PreviewInputs:
-
     from bodycap_batch.overlay import bones_from_motion, make_camera_views
     from bodycap_batch.preview import PreviewInputs
 

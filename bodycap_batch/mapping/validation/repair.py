@@ -40,14 +40,16 @@ def repair_model(
 ) -> tuple[Any, dict[str, object]]:
     """Register misregistered keyframes once more, and remove those that still contradict the model.
 
-    The keyframes leave the model before they are registered again. Without them, the points that they bent
-    are right, so most find their true place. The model is not adjusted after the last removal: the stage
+    The keyframes leave the model before they are registered again. Points that they had moved are right
+    without them, so most find their true place. If fewer keyframes agree with the model then, the model
+    without the misregistered keyframes is kept. The model is not adjusted after the last removal: the stage
     adjusts it at its end (`finalise_models`). Evidence: docs/decisions/mapping.md.
 
     Args:
         model: The largest model; not changed.
         context: Workspace, intrinsics, mapper options.
-        total: Number of all keyframes, for the progress; None to register none again.
+        total: Number of all keyframes, for the progress. None to register none again: the cut keyframes of a
+            large map are placed with those that it left out (`resect_remaining`).
 
     Returns:
         The model; entries for the log: the keyframes that were registered again and those that were removed,
@@ -57,9 +59,11 @@ def repair_model(
     doubtful = _names(model, wrong)
     if wrong and total is not None and is_on(Mechanism.REPAIR):
         # Most keyframes that are registered from their matches alone are removed again.
-        model = re_register_images(model, wrong, context, total, structure_less=False)
-        record_act(Mechanism.REPAIR)
-        pairs, wrong = _find_contradictions(model, context)
+        other = re_register_images(model, wrong, context, total, structure_less=False)
+        other_pairs, still_wrong = _find_contradictions(other, context)
+        if other.num_reg_images() - len(still_wrong) >= model.num_reg_images() - len(wrong):
+            model, pairs, wrong = other, other_pairs, still_wrong
+            record_act(Mechanism.REPAIR)
     cameras = {
         int(number): ImageRef.parse(model.image(number).name).camera for number in model.reg_image_ids()
     }

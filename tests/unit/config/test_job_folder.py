@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+from collections.abc import Iterator
 from itertools import combinations, permutations
 from pathlib import Path
 
@@ -291,3 +293,18 @@ def test_sidecars_are_named_after_the_video_or_the_camera(
     path.write_text("capture: {cameras: [{name: torso, video: GX01.MP4}]}")
     timestamps = load_job(path).capture.cameras[0].timestamps
     assert timestamps == (() if found is None else (tmp_path / found,))
+
+
+def test_a_failing_disk_is_no_fault_of_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = folder(tmp_path / "walk", "torso.mp4") / "job.yaml"
+    path.write_text("capture: {cameras: [{name: torso, video: torso.mp4}]}\n")
+    read = Path.iterdir
+
+    def failing(self: Path) -> Iterator[Path]:
+        if self == path.parent:
+            raise OSError(errno.EIO, "Input/output error")
+        return read(self)
+
+    monkeypatch.setattr(Path, "iterdir", failing)
+    with pytest.raises(OSError, match="Input/output"):
+        load_job(path)
