@@ -48,6 +48,13 @@ def test_offsets_and_drifts_are_recovered_at_camera_time_0():
     assert clocks["torso"].sigma_s == 0.0
 
 
+def test_a_drift_that_no_pair_measures_is_0_with_the_sigma_of_crystals():
+    short = [pair("torso", "head", drift_measured=False, drift_ppm=0.0, drift_sigma_ppm=CRYSTAL_SIGMA_PPM)]
+    clock = solve_clocks("torso", short, STARTS, FLOORS).clocks["head"]
+    assert clock.drift_ppm == 0.0
+    assert clock.drift_sigma_ppm == pytest.approx(CRYSTAL_SIGMA_PPM, rel=0.01)
+
+
 def test_another_reference_gives_the_same_differences():
     clocks = solve_clocks("left", all_pairs(), STARTS, FLOORS).clocks
     assert clocks["left"].offset_s == 0.0
