@@ -15,14 +15,16 @@ import yaml
 from bodycap_batch.config.models import Job
 from bodycap_batch.core.errors import EstimationError
 from bodycap_batch.pipeline import Settings, run_job
+from bodycap_batch.pipeline.exporting import export_for
 from bodycap_batch.pipeline.flow import _read_ahead
+from bodycap_batch.pipeline.job_facts import JobFacts
 from bodycap_batch.pipeline.stage_runner import StageRunner
 from bodycap_batch.runner import Children, Task, TaskEnvironment
 from bodycap_batch.runner.child_pool import do_nothing
 from bodycap_batch.store.artefacts import Store
 from bodycap_batch.store.code_version import Program
 from bodycap_batch.tasks.stages import STAGES
-from tests.pipeline.test_run import CAMERAS, CHILD, Bench, bench
+from tests.pipeline.test_run import CAMERAS, CHILD, FOUND, Bench, bench, unplaced_job
 
 __all__ = ["bench"]
 
@@ -242,3 +244,31 @@ def test_the_files_state_the_lens_that_was_given(bench: Bench) -> None:
         settings=replace(bench.settings(), executor=children),
     )
     assert children.arguments["export"]["freed"] == {"left_palm": pytest.approx(50.0 / 64.0)}
+
+
+def test_an_export_for_a_program_uses_the_lens_of_the_run(bench: Bench) -> None:
+    bench.order(wrong={"given": 4})
+    job = bench.job(**GIVEN)
+    run_job(job, out_dir=bench.out, settings=bench.settings())
+    children = Watched()
+    settings = replace(bench.settings(), executor=children)
+    # The stand-in for the export writes files of other names.
+    with pytest.raises(EstimationError, match="was not written"):
+        export_for(job, "blender", out_dir=bench.out, folder=bench.out / "b", fps=None, settings=settings)
+    assert children.arguments.keys() == {"export"}
+    assert children.arguments["export"]["freed"] == {"left_palm": pytest.approx(50.0 / 64.0)}
+
+
+def test_places_from_the_motion_keep_the_clocks_that_are_known_from_the_sound(bench: Bench) -> None:
+    job = unplaced_job(bench)
+    cameras = tuple(
+        camera.model_copy(update={"offset_s": 0.5 + number})
+        for number, camera in enumerate(job.capture.cameras)
+    )
+    facts = replace(JobFacts.of(job), capture=job.capture.model_copy(update={"cameras": cameras}))
+    placed = facts.with_places(FOUND)
+    for capture in (placed.capture, placed.job.capture):
+        assert {camera.name: camera.mount for camera in capture.cameras} == FOUND
+    assert [camera.offset_s for camera in placed.capture.cameras] == [0.5, 1.5, 2.5][: len(cameras)]
+    stated = [camera.offset_s for camera in job.capture.cameras]
+    assert [camera.offset_s for camera in placed.job.capture.cameras] == stated

@@ -109,8 +109,8 @@ def _find_contradictions(
     """Return the verified pairs of a model, and the ids of the images that contradict it.
 
     These are the images whose pose or points contradict matches; if no part of the model agrees with itself,
-    only those whose pose does. An image whose points alone contradict matches is acquitted if a second
-    registration confirms its pose.
+    only those whose pose does. An image whose points alone contradict matches is no such image if a
+    second registration confirms its pose.
     """
     pairs = evaluate_pairs(context.workspace, model, context.times_ns)
     misregistered = find_misregistered_images(pairs)
@@ -122,9 +122,9 @@ def _find_contradictions(
         return pairs, wrong
     max_error_px = _CONFIRMED_ERROR_RATIO * context.mapper_options().mapper.filter_max_reproj_error
     confirmed = confirm_images(context.workspace, model, wrong, image_sequences(model), max_error_px)
-    acquitted = confirmed - misregistered
-    record_act(Mechanism.SECOND_REGISTRATION, len(acquitted))
-    return pairs, wrong - acquitted
+    confirmed -= misregistered
+    record_act(Mechanism.SECOND_REGISTRATION, len(confirmed))
+    return pairs, wrong - confirmed
 
 
 def _names(model: pycolmap.Reconstruction, image_ids: Collection[int]) -> list[str]:

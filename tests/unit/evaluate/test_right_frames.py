@@ -188,6 +188,23 @@ def test_the_turn_of_the_video_shows_a_fold_across_lost_frames(path: FloatArray)
     assert find_right_frames(seen, folded).count(Outcome.WRONG) == 40
 
 
+@pytest.mark.parametrize(("has_features", "outcome"), [(True, "right"), (False, "not measurable")])
+def test_pairs_decide_where_the_turn_of_the_video_is_inexact(
+    path: FloatArray, has_features: bool, outcome: str
+) -> None:
+    posed = np.ones(FRAMES, dtype=bool)
+    # Without the first frames, no frame is far enough from another one for a second view of its place.
+    posed[:15], posed[25:75] = False, False
+    seen = [each if has_features or posed[frame] else None for frame, each in enumerate(pictures(path))]
+    turns = so3_log(np.swapaxes(path[1:, :3, :3], 1, 2) @ path[:-1, :3, :3])
+    turns[50] += np.deg2rad([0.0, 7.0, 0.0])
+    sigma_rad = np.where(np.arange(FRAMES - 1) == 50, np.deg2rad(3.0), 1e-4)
+    chain = RotationChain(frames=np.arange(FRAMES), turns=turns, sigma_rad=sigma_rad, turn_sigma=0.0)
+    found = outcomes(Pictures(seen, rotation_chain=chain), np.where(posed[:, None, None], path, np.nan))
+    assert (found[15:25] == outcome).all()
+    assert (found[75:] == "right").all(), "the larger part"
+
+
 def test_one_wrong_measurement_among_right_ones_is_no_break() -> None:
     right = [(index, index + 1) for index in range(9)]
     assert contradicted_times([(2, 7)], right, 10, 1) == []

@@ -31,6 +31,7 @@ from bodycap_batch.mapping.re_registration import re_register_images
 from bodycap_batch.mapping.reconstruction.bundle_adjustment import (
     adjust_and_filter,
     adjust_robustly,
+    sub_model,
 )
 from bodycap_batch.mapping.reconstruction.incremental_mapper import _MapperRun, register_images
 from bodycap_batch.mapping.reconstruction.initial_pair import find_user_pair, rank_initial_pairs
@@ -367,6 +368,15 @@ def test_a_misregistered_block_is_found_and_repaired(
     for left in (alone, cut, remove_without_adjustment(wrong, mapping)[0]):
         assert left.num_reg_images() == KEYFRAMES - len(_MOVED)
         assert _rms(left, poses) < 0.01
+    # A registration that loses right keyframes is not taken.
+    right = set(wrong.reg_image_ids()) - {
+        number for ref, number in _ids(mapping).items() if ref.frame in _MOVED
+    }
+    fewer = sub_model(wrong, right - set(sorted(right)[-3:]))
+    monkeypatch.setattr(module, "with_new_images", lambda *_, **__: fewer)
+    kept, log = repair_model(wrong, mapping, KEYFRAMES)
+    assert log["cut"] == log["doubtful"] == names
+    assert kept.num_reg_images() == KEYFRAMES - len(_MOVED)
 
 
 def test_keyframes_are_registered_again_against_the_rest(
