@@ -206,7 +206,7 @@ def build_map_once(
     write_models(workspace, models)
     calibrated = {number: name for name, number in ids.items() if number in mapping.given_ids}
     misfits = find_misfit_intrinsics(models[0], mapping.mapper_options(), calibrated)
-    # A keyframe that was registered again is in a model, and so is none of the misplaced ones.
+    # `misplaced_frames` leaves out those that were found when they were registered again.
     removed = list(log["repair"]["doubtful"]) if models and "repair" in log else []
     removed += [name for step in ("repair", "placed") if step in log for name in log[step]["cut"]]
     misplaced = misplaced_frames([*removed, *log.get("contradicting", ())], models)

@@ -109,7 +109,7 @@ def _find_contradictions(
     """Return the verified pairs of a model, and the ids of the images that contradict it.
 
     These are the images whose pose or points contradict matches; if no part of the model agrees with itself,
-    only those whose pose does. An image whose points alone contradict matches is no such image if a
+    only those whose pose does. An image whose points alone contradict matches is not among them if a
     second registration confirms its pose.
     """
     pairs = evaluate_pairs(context.workspace, model, context.times_ns)
